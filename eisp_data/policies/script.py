@@ -1,0 +1,180 @@
+"""Scripted policies: keyframes that a generator yields while it watches its world.
+
+A script is an ordinary Python generator. It reads the live ``View`` of its world, yields the next
+``Keyframe``, and goes on when the gripper is there::
+
+    def touch(view: View, aim: Aim) -> Iterator[Keyframe]:
+        yield Keyframe(view.blocks[0] + [0, 0, 0.08], OPEN)
+
+The same script makes the oracle (no noise, the whole task) and the collector's demonstrations
+(noise, a random part of the task).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from eisp_data.tasks.base import ACTION_SCALE_M, Task
+
+OPEN, CLOSED = 1.0, -1.0
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """Where the gripper goes next, and with which fingers."""
+
+    position: np.ndarray
+    """(3,) m, of the point between the fingertips."""
+    fingers: float
+    """OPEN or CLOSED."""
+    tolerance_m: float = 0.008
+    hold_steps: int = 0
+    """Steps to stay once there, while the fingers move."""
+    most_steps: int = 25
+    """Steps after which the script goes on wherever the gripper is."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What separates a demonstration from the oracle."""
+
+    action_std: float = 0.0
+    """Standard deviation of the Gaussian added to every action component."""
+    aim_std_m: float = 0.0
+    """Standard deviation of the places that a script aims at, drawn anew for each."""
+    slowest: float = 1.0
+    """Each episode moves at a share of full speed drawn from [slowest, 1]."""
+    slip: float = 0.0
+    """Probability, per step, that the fingers do the opposite for a few steps."""
+    partial: bool = False
+    """Whether the script does a random part of the task only (a random level of the goal)."""
+
+
+class View:
+    """One world, as its script sees it: privileged information, always current."""
+
+    def __init__(self, task: Task, states: np.ndarray, row: int, goal: np.ndarray) -> None:
+        self._task = task
+        self.states = states
+        self._row = row
+        self.goal = goal.reshape(-1, 3)
+        """(objects, 3) m, the desired positions."""
+
+    @property
+    def _state(self) -> np.ndarray:
+        return self.states[self._row : self._row + 1]
+
+    @property
+    def gripper(self) -> np.ndarray:
+        """(3,) m."""
+        return self._task.qpos(self._state)[0, :3].copy()
+
+    @property
+    def blocks(self) -> np.ndarray:
+        """(blocks, 3) m."""
+        return self._task.block_positions(self._state)[0].copy()
+
+    @property
+    def objects(self) -> np.ndarray:
+        """(objects, 3) m, the achieved goal."""
+        return self._task.achieved_goal(self._state)[0].reshape(-1, 3).astype(float)
+
+
+@dataclass
+class Aim:
+    """The randomness of one episode's script."""
+
+    rng: np.random.Generator
+    noise: Noise
+
+    def at(self, position: np.ndarray) -> np.ndarray:
+        """Return the position as this demonstrator hits it: displaced in the plane."""
+        miss = np.append(self.rng.normal(0.0, self.noise.aim_std_m, 2), 0.0)
+        return position + np.clip(miss, -3 * self.noise.aim_std_m, 3 * self.noise.aim_std_m)
+
+    def part(self, whole: int) -> int:
+        """Return how much of a task of so many parts to do."""
+        return int(self.rng.integers(1, whole + 1)) if self.noise.partial else whole
+
+
+Script = Callable[[View, Aim], Iterator[Keyframe]]
+
+
+class _Actor:
+    """One world's script in progress."""
+
+    def __init__(self, script: Script, view: View, aim: Aim) -> None:
+        self.view, self.aim = view, aim
+        self.speed = aim.rng.uniform(aim.noise.slowest, 1.0)
+        self.frames = script(view, aim)
+        self.frame: Keyframe | None = None
+        self.finished = False
+        self._steps = self._held = self._slipping = 0
+        self._next()
+
+    def _next(self) -> None:
+        self._steps = self._held = 0
+        frame = next(self.frames, None)
+        if frame is None:
+            self.finished = True
+        else:
+            self.frame = frame
+
+    def act(self) -> np.ndarray:
+        """Return the action (4,) towards the current keyframe."""
+        gripper = self.view.gripper
+        if self.frame is None:
+            self.frame = Keyframe(gripper, OPEN)
+        if not self.finished:
+            there = np.linalg.norm(self.frame.position - gripper) <= self.frame.tolerance_m
+            if (there and self._held >= self.frame.hold_steps) or (
+                self._steps >= self.frame.most_steps
+            ):
+                self._next()
+            self._held += bool(there)
+            self._steps += 1
+        return self._noisy((self.frame.position - gripper) / ACTION_SCALE_M, self.frame.fingers)
+
+    def _noisy(self, displacement: np.ndarray, fingers: float) -> np.ndarray:
+        noise, rng = self.aim.noise, self.aim.rng
+        if noise.slip and self._slipping == 0 and rng.random() < noise.slip:
+            self._slipping = int(rng.integers(2, 6))
+        if self._slipping:
+            self._slipping -= 1
+            fingers = -fingers
+        action = np.append(np.clip(displacement, -self.speed, self.speed), fingers)
+        if noise.action_std:
+            action += rng.normal(0.0, noise.action_std, 4)
+        return np.clip(action, -1.0, 1.0)
+
+
+class ScriptedPolicy:
+    """One script played in each world of a batch."""
+
+    def __init__(self, task: Task, script: Script, noise: Noise, worlds: int) -> None:
+        self._task, self._script, self._noise = task, script, noise
+        self._actors: list[_Actor | None] = [None] * worlds
+
+    def begin(self, world: int, state: np.ndarray, goal: np.ndarray, seed: int) -> None:
+        """Start the script of one world; ``state`` is the (N, P) batch, ``goal`` (G,)."""
+        # A stream of its own: the world's start and its demonstrator share the seed.
+        aim = Aim(np.random.default_rng([seed, 1]), self._noise)
+        view = View(self._task, state, world, goal)
+        self._actors[world] = _Actor(self._script, view, aim)
+
+    def act(self, state: np.ndarray) -> np.ndarray:
+        """Return (N, 4) float32 actions in the (N, P) states; zeros where no script has begun."""
+        action = np.zeros((len(state), 4), np.float32)
+        for world, actor in enumerate(self._actors):
+            if actor is not None:
+                actor.view.states = state
+                action[world] = actor.act()
+        return action
+
+    @property
+    def finished(self) -> np.ndarray:
+        """(N,) bool: the script has come to its end."""
+        return np.array([actor is None or actor.finished for actor in self._actors])

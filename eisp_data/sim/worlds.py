@@ -1,0 +1,69 @@
+"""A batch of worlds of one task that are reset and stepped together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from eisp_data.tasks.base import Task, is_success
+
+
+class Worlds:
+    """N worlds of one task.
+
+    Attributes:
+        state: (N, P) float64, MuJoCo's full physics states.
+        desired_goal: (N, G) float32.
+        steps: (N,) int64, actions since the last reset.
+    """
+
+    def __init__(self, task: Task, count: int, threads: int | None = None) -> None:
+        self.task = task
+        self.count = count
+        self._physics = task.physics(threads)
+        self.state = np.zeros((count, self._physics.state_dim))
+        self.desired_goal = np.zeros((count, task.paper.goal_dim), np.float32)
+        self.steps = np.zeros(count, np.int64)
+
+    def reset(self, seeds: Sequence[int] | np.ndarray, worlds: np.ndarray | None = None) -> None:
+        """Start the named worlds (all, if left out) anew, each from its own seed."""
+        indices = np.arange(self.count) if worlds is None else np.asarray(worlds)
+        for index, seed in zip(indices, seeds, strict=True):
+            rng = np.random.default_rng(int(seed))
+            self.state[index], self.desired_goal[index] = self.task.reset(rng)
+        self.steps[indices] = 0
+
+    def restore(
+        self, state: np.ndarray, desired_goal: np.ndarray, worlds: np.ndarray | None = None
+    ) -> None:
+        """Put the named worlds (all, if left out) into recorded (n, P) states with (n, G) goals."""
+        indices = np.arange(self.count) if worlds is None else np.asarray(worlds)
+        self.state[indices] = state
+        self.desired_goal[indices] = desired_goal
+        self.steps[indices] = 0
+
+    def step(self, action: np.ndarray) -> None:
+        """Apply (N, A) actions for one control period."""
+        self.state = self._physics.step(self.state, self.task.control(self.state, action))
+        self.steps += 1
+
+    @property
+    def observation(self) -> np.ndarray:
+        """(N, S) float32."""
+        return self.task.observe(self.state)
+
+    @property
+    def achieved_goal(self) -> np.ndarray:
+        """(N, G) float32."""
+        return self.task.achieved_goal(self.state)
+
+    @property
+    def success(self) -> np.ndarray:
+        """(N,) bool: the paper's Eq. (1) holds now."""
+        return is_success(self.achieved_goal, self.desired_goal)
+
+    @property
+    def truncated(self) -> np.ndarray:
+        """(N,) bool: the episode has had its L steps."""
+        return self.steps >= self.task.paper.episode_steps

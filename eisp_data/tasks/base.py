@@ -1,0 +1,207 @@
+"""What every table-top task shares: its state, its observation, its action and its reward.
+
+A task is stateless. All its methods are vectorised over the N worlds of a batch.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import mujoco
+import numpy as np
+
+from eisp_data.sim.physics import Physics
+from eisp_data.sim.rotation import euler_from_quaternion, rotate
+from eisp_data.sim.scene import FINGER_TRAVEL_M, WORKSPACE_HIGH_M, WORKSPACE_LOW_M
+from eisp_data.tasks.paper import PaperSettings
+
+GRIPPER_DIM = 10
+"""Position 3, fingers 2, velocity 3, finger velocities 2."""
+OBJECT_DIM = 15
+"""Position 3, position relative to the gripper 3, orientation 3, velocity 3, angular velocity 3."""
+SUCCESS_DISTANCE_M = 0.05
+"""epsilon of the paper's Eq. (1), on the norm of the whole goal error."""
+ACTION_SCALE_M = 0.04
+"""Displacement commanded by an action of 1: 1 m/s at 25 Hz, the tool speed of a UR3."""
+
+_AT_REST_M_S = 0.02
+_GRIPPER_JOINTS = 5
+
+
+@dataclass(frozen=True)
+class ObjectSlot:
+    """Where one object of the goal stands in the observation and in the goal."""
+
+    kind: str
+    """Objects of one kind are interchangeable."""
+    observation: slice
+    """Its OBJECT_DIM features in the observation."""
+    goal: slice
+    """Its position in the goal."""
+
+
+def compute_reward(
+    achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Mapping[str, Any] | None = None
+) -> np.ndarray:
+    """Return the paper's Eq. (1): 0 where the norm of the goal error is at most 5 cm, else -1.
+
+    Args:
+        achieved_goal: (..., G) metres.
+        desired_goal: (..., G) metres.
+        info: not used; Gymnasium's ``GoalEnv`` passes it.
+
+    Returns:
+        (...) float32.
+    """
+    return np.where(is_success(achieved_goal, desired_goal), 0.0, -1.0).astype(np.float32)
+
+
+def is_success(achieved_goal: np.ndarray, desired_goal: np.ndarray) -> np.ndarray:
+    """Return whether the norm of the whole (..., G) goal error is at most 5 cm, (...) bool."""
+    return np.linalg.norm(achieved_goal - desired_goal, axis=-1) <= SUCCESS_DISTANCE_M
+
+
+class Task(ABC):
+    """A goal-conditioned task on the table.
+
+    ``qpos`` is ``[gripper 3, fingers 2, fixtures F, blocks 7 each]``, ``qvel`` likewise with 6 a
+    block; states are MuJoCo's full physics state ``[time, qpos, qvel]``.
+    """
+
+    name: ClassVar[str]
+    instruction: ClassVar[str]
+    """What one would tell the robot; the task string of the LeRobot dataset."""
+    paper: ClassVar[PaperSettings]
+    blocks: ClassVar[int]
+    fixtures: ClassVar[int] = 0
+    """Slide joints between the gripper's and the blocks'."""
+    fingers_closed: ClassVar[bool] = False
+    """Whether the fourth action has no effect."""
+
+    @property
+    @abstractmethod
+    def model(self) -> mujoco.MjModel:
+        """The compiled scene."""
+
+    @abstractmethod
+    def reset(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Draw a start state (P,) and a desired goal (G,)."""
+
+    @property
+    def objects(self) -> tuple[ObjectSlot, ...]:
+        """The objects of the goal, in the order of the goal."""
+        return tuple(
+            ObjectSlot(
+                kind="block",
+                observation=slice(GRIPPER_DIM + OBJECT_DIM * i, GRIPPER_DIM + OBJECT_DIM * (i + 1)),
+                goal=slice(3 * i, 3 * i + 3),
+            )
+            for i in range(self.blocks)
+        )
+
+    def control(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
+        """Turn (N, 4) actions in [-1, 1] into (N, 5) servo targets.
+
+        The first three move the gripper relative to where it is, within the workspace; the fourth
+        opens (1) or closes (-1) the fingers.
+        """
+        action = np.clip(action, -1.0, 1.0)
+        target = np.empty((len(state), _GRIPPER_JOINTS))
+        target[:, :3] = np.clip(
+            self.qpos(state)[:, :3] + ACTION_SCALE_M * action[:, :3],
+            WORKSPACE_LOW_M,
+            WORKSPACE_HIGH_M,
+        )
+        opening = 0.0 if self.fingers_closed else (action[:, 3:] + 1.0) / 2.0
+        target[:, 3:] = FINGER_TRAVEL_M * opening
+        return target
+
+    def observe(self, state: np.ndarray) -> np.ndarray:
+        """Return the (N, S) float32 observations of (N, P) states."""
+        qpos, qvel = self.qpos(state), self.qvel(state)
+        parts = [qpos[:, :5], qvel[:, :5]]
+        for index in range(self.blocks):
+            parts += self._block_features(qpos, qvel, index)
+        return np.concatenate(parts + self.extra_features(state), axis=1).astype(np.float32)
+
+    def extra_features(self, state: np.ndarray) -> list[np.ndarray]:
+        """Return what the fixtures add to the observation, each (N, ...)."""
+        return []
+
+    def achieved_goal(self, state: np.ndarray) -> np.ndarray:
+        """Return phi(s), the (N, G) float32 positions of the goal's objects."""
+        return self.block_positions(state).reshape(len(state), -1).astype(np.float32)
+
+    def settled(self, state: np.ndarray) -> np.ndarray:
+        """Return whether every block is at rest and no block is held, (N,) bool."""
+        speeds = self._block_qvel(state)[..., :3]
+        slow = (np.linalg.norm(speeds, axis=-1) < _AT_REST_M_S).all(axis=1)
+        return slow & self.hands_off(state)
+
+    def hands_off(self, state: np.ndarray) -> np.ndarray:
+        """Return whether no block is between the fingers, (N,) bool."""
+        offset = np.abs(self.block_positions(state) - self.qpos(state)[:, None, :3])
+        near = (offset < 0.03).all(axis=-1).any(axis=1)
+        squeezed = self.qpos(state)[:, 3:5].mean(axis=1) < 0.029
+        return ~(near & squeezed)
+
+    def block_positions(self, state: np.ndarray) -> np.ndarray:
+        """Return the (N, blocks, 3) positions of the blocks' centres."""
+        start = _GRIPPER_JOINTS + self.fixtures
+        return self.qpos(state)[:, start:].reshape(len(state), self.blocks, 7)[..., :3]
+
+    def qpos(self, state: np.ndarray) -> np.ndarray:
+        """Return the view (..., nq) of the joint positions."""
+        return state[..., 1 : 1 + self.model.nq]
+
+    def qvel(self, state: np.ndarray) -> np.ndarray:
+        """Return the view (..., nv) of the joint velocities."""
+        return state[..., 1 + self.model.nq :]
+
+    def state_of(
+        self, gripper: np.ndarray, blocks: np.ndarray, fixtures: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Return the state (P,) at rest with open fingers and upright blocks.
+
+        Args:
+            gripper: (3,) position between the fingertips.
+            blocks: (blocks, 3) positions.
+            fixtures: (F,) positions of the fixtures' slides, zero if left out.
+        """
+        state = np.zeros(1 + self.model.nq + self.model.nv)
+        qpos = self.qpos(state)
+        qpos[:3] = gripper
+        qpos[3:5] = 0.0 if self.fingers_closed else FINGER_TRAVEL_M
+        start = _GRIPPER_JOINTS + self.fixtures
+        if fixtures is not None:
+            qpos[_GRIPPER_JOINTS:start] = fixtures
+        poses = qpos[start:].reshape(self.blocks, 7)
+        poses[:, :3] = blocks
+        poses[:, 3] = 1.0
+        return state
+
+    def physics(self, threads: int | None = None) -> Physics:
+        """Return the batched physics of this task's scene."""
+        return Physics(self.model, threads)
+
+    def _block_qvel(self, state: np.ndarray) -> np.ndarray:
+        start = _GRIPPER_JOINTS + self.fixtures
+        return self.qvel(state)[:, start:].reshape(len(state), self.blocks, 6)
+
+    def _block_features(self, qpos: np.ndarray, qvel: np.ndarray, index: int) -> list[np.ndarray]:
+        pose_start = _GRIPPER_JOINTS + self.fixtures + 7 * index
+        velocity_start = _GRIPPER_JOINTS + self.fixtures + 6 * index
+        position = qpos[:, pose_start : pose_start + 3]
+        quaternion = qpos[:, pose_start + 3 : pose_start + 7]
+        velocity = qvel[:, velocity_start : velocity_start + 3]
+        spin = qvel[:, velocity_start + 3 : velocity_start + 6]
+        return [
+            position,
+            position - qpos[:, :3],
+            euler_from_quaternion(quaternion),
+            velocity,
+            rotate(quaternion, spin),  # MuJoCo's free joint keeps it in the frame of the body
+        ]
