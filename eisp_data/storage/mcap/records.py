@@ -32,6 +32,8 @@ FOOTER = struct.Struct("<QQI")
 
 MAX_CHUNK_BYTES = 256 * 2**20
 """The largest chunk that is read, compressed or not; recorders write 1 to 8 MiB."""
+_ZSTD_WINDOW_BYTES = 128 * 2**20
+"""What the highest level of compression may need, however small the chunk."""
 COMPRESSIONS = (b"", b"lz4", b"zstd")
 
 
@@ -119,7 +121,8 @@ def _zstd(data: bytes, size: int) -> bytes:
 
     try:
         # One-shot decompression would allocate whatever the frame's own header claims.
-        decoder = zstandard.ZstdDecompressor(max_window_size=2 * MAX_CHUNK_BYTES)
+        window = max(size, _ZSTD_WINDOW_BYTES)
+        decoder = zstandard.ZstdDecompressor(max_window_size=window)
         with decoder.stream_reader(io.BytesIO(data), read_across_frames=True) as stream:
             return stream.read(size + 1)
     except (zstandard.ZstdError, MemoryError) as error:
@@ -144,7 +147,8 @@ def parse_message(body: bytes) -> Message:
     """Parse the body of a message record."""
     if len(body) < MESSAGE_HEADER.size:
         raise BadRecord("message too short")
-    return Message(*MESSAGE_HEADER.unpack_from(body), body[MESSAGE_HEADER.size :])
+    channel, sequence, log_time_ns, publish_time_ns = MESSAGE_HEADER.unpack_from(body)
+    return Message(channel, sequence, log_time_ns, publish_time_ns, body[MESSAGE_HEADER.size :])
 
 
 def parse_definition(opcode: int, body: bytes) -> Schema | Channel:

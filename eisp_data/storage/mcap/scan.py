@@ -74,19 +74,18 @@ def walk(file: BinaryIO) -> Layout:
             elif opcode in (Opcode.ATTACHMENT, Opcode.METADATA):
                 layout.extras.append((opcode, at, end - at))
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                loose.extend(at, end)
+                loose.extend(at, end, layout)
             layout.ended = opcode == Opcode.DATA_END
             at = end
         except BadRecord as error:
             loose.close(layout)
+            layout.problems.append(f"byte {at}: {error}")
             # A wrong length may have carried the walk past good chunks: search from the last
             # place that was certain.
-            found = _next_chunk(file, max(trusted, len(records.MAGIC)), at, size)
-            lost = (size if found is None else found) - at
-            layout.problems.append(f"byte {at}: {error}")
-            layout.skipped_bytes += max(lost, 0)
-            layout.segments = [s for s in layout.segments if s.offset < trusted]
-            at = trusted = size if found is None else found
+            found = _next_chunk(file, trusted, size)
+            layout.skipped_bytes += max(found - at, 0)
+            layout.segments = [s for s in layout.segments if s.offset < found]
+            at = trusted = found
     loose.close(layout)
     if not layout.ended:
         layout.problems.append("no end of data: the recording was cut off")
@@ -110,21 +109,18 @@ def _name(opcode: int) -> str:
     return Opcode(opcode).name.lower().replace("_", " ") if opcode < 0x80 else "private"
 
 
-def _next_chunk(file: BinaryIO, start: int, bad: int, size: int) -> int | None:
-    """Return the offset of the first thing at or after ``start`` that has the shape of a chunk.
-
-    ``bad`` is where the walk failed: a chunk that begins there is the broken one itself.
-    """
+def _next_chunk(file: BinaryIO, start: int, size: int) -> int:
+    """Return the offset of the first whole chunk at or after ``start``, or ``size``."""
     at, overlap = start, 64
     while at < size:
         file.seek(at)
         block = file.read(_SEARCH_BYTES + overlap)
         for match in _CHUNK_SHAPE.finditer(block):
             offset = at + match.start()
-            if offset != bad and _is_chunk(file, offset, size):
+            if _is_chunk(file, offset, size):
                 return offset
         at += _SEARCH_BYTES
-    return None
+    return size
 
 
 def _is_chunk(file: BinaryIO, offset: int, size: int) -> bool:
@@ -147,21 +143,26 @@ class _Loose:
     def add(self, file: BinaryIO, at: int, end: int, layout: Layout) -> None:
         """Take in the message record at ``at``, whose header has just been read."""
         head = file.read(records.MESSAGE_HEADER.size)
+        if end - at < records.RECORD_HEADER.size + records.MESSAGE_HEADER.size:
+            raise BadRecord("message too short")
         if end - at > MAX_RECORD_BYTES:
             raise BadRecord(f"message of {end - at} bytes (limit {MAX_RECORD_BYTES})")
         log_time_ns = records.parse_message(head).log_time_ns
         if end - self.start > LOOSE_SEGMENT_BYTES:
             self.close(layout)
-        self.extend(at, end)
+        self.extend(at, end, layout)
         self.first_ns = log_time_ns if self.first_ns is None else min(self.first_ns, log_time_ns)
         self.last_ns = max(self.last_ns, log_time_ns)
 
-    def extend(self, at: int, end: int) -> None:
+    def extend(self, at: int, end: int, layout: Layout) -> None:
+        """Take in the record from ``at`` to ``end``, after a gap as a new segment."""
         if at != self.end:
-            self.start, self.first_ns, self.last_ns = at, None, 0
+            self.close(layout)
+            self.start = at
         self.end = end
 
     def close(self, layout: Layout) -> None:
+        """End the segment, if there is one."""
         if self.end > self.start:
             first = 0 if self.first_ns is None else self.first_ns
             layout.segments.append(
