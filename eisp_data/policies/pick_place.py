@@ -12,6 +12,8 @@ from eisp_data.sim.scene import BLOCK_SIZE_M
 _FINGER_BELOW_M = 0.014
 """The fingertips end this far below the point between them."""
 _CLEARANCE_M = 0.02
+_TIPS_CLEAR_M = BLOCK_SIZE_M / 2 + _FINGER_BELOW_M + 0.014
+"""From a block's centre to where the fingertips pass over it."""
 
 
 def lifted(position: np.ndarray, height_m: float) -> np.ndarray:
@@ -22,7 +24,7 @@ def lifted(position: np.ndarray, height_m: float) -> np.ndarray:
 def pick(view: View, aim: Aim, block: int, height_m: float) -> Iterator[Keyframe]:
     """Go over the block at a height that clears everything, grasp it."""
     over = view.blocks[block]
-    approach = max(over[2] + BLOCK_SIZE_M / 2 + _FINGER_BELOW_M + 0.012, 0.0)
+    approach = over[2] + _TIPS_CLEAR_M
     if height_m > approach + 0.02:
         yield Keyframe(lifted(over, height_m), OPEN, tolerance_m=0.03)
     yield Keyframe(lifted(over, approach), OPEN, tolerance_m=0.012)
@@ -38,7 +40,7 @@ def place(view: View, aim: Aim, target: np.ndarray, height_m: float) -> Iterator
     yield Keyframe(lifted(target, height_m), CLOSED, tolerance_m=0.010)
     yield Keyframe(target + [0, 0, 0.003], CLOSED, tolerance_m=0.006)
     yield Keyframe(target + [0, 0, 0.003], OPEN, tolerance_m=0.02, hold_steps=1, most_steps=3)
-    yield Keyframe(target + [0, 0, BLOCK_SIZE_M / 2 + _FINGER_BELOW_M], OPEN, tolerance_m=0.012)
+    yield Keyframe(target + [0, 0, _TIPS_CLEAR_M], OPEN, tolerance_m=0.012)
 
 
 def carry_height(view: View, without: int, target: np.ndarray) -> float:

@@ -8,6 +8,6 @@ from eisp_data.policies.stack import stack
 SCRIPTS: dict[str, Script] = {"stack": stack}
 
 DEMONSTRATOR: dict[str, Noise] = {
-    "stack": Noise(action_std=0.2, aim_std_m=0.004, slowest=0.5, slip=0.01, partial=True),
+    "stack": Noise(action_std=0.15, aim_std_m=0.004, slowest=0.6, slip=0.004, partial=True),
 }
 """Clumsy enough that at most 10% of the episodes succeed (the paper's appendix)."""

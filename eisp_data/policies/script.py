@@ -20,6 +20,7 @@ import numpy as np
 from eisp_data.tasks.base import ACTION_SCALE_M, Task
 
 OPEN, CLOSED = 1.0, -1.0
+_LEAST_EFFORT = 0.25
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,9 @@ class Noise:
     """What separates a demonstration from the oracle."""
 
     action_std: float = 0.0
-    """Standard deviation of the Gaussian added to every action component."""
+    """Standard deviation of the Gaussian added to a displacement at full speed; it shrinks with
+    the displacement to a quarter, as human movements are noisiest when fastest (Harris and
+    Wolpert 1998)."""
     aim_std_m: float = 0.0
     """Standard deviation of the places that a script aims at, drawn anew for each."""
     slowest: float = 1.0
@@ -51,6 +54,11 @@ class Noise:
     """Probability, per step, that the fingers do the opposite for a few steps."""
     partial: bool = False
     """Whether the script does a random part of the task only (a random level of the goal)."""
+    whole_share: float = 0.1
+    """Share of the partial scripts that attempt the whole task all the same."""
+    least_s: float = 4.0
+    """A partial script that is done earlier goes on with parts at places of its own; 4 s are the
+    100 steps of the shortest trajectories in the paper's appendix."""
 
 
 class View:
@@ -66,6 +74,11 @@ class View:
     @property
     def _state(self) -> np.ndarray:
         return self.states[self._row : self._row + 1]
+
+    @property
+    def time_s(self) -> float:
+        """Seconds since the reset."""
+        return float(self._state[0, 0])
 
     @property
     def gripper(self) -> np.ndarray:
@@ -129,7 +142,7 @@ class _Actor:
         if self.frame is None:
             self.frame = Keyframe(gripper, OPEN)
         if not self.finished:
-            there = np.linalg.norm(self.frame.position - gripper) <= self.frame.tolerance_m
+            there = np.linalg.norm(self.frame.position - gripper) <= self._tolerance_m()
             if (there and self._held >= self.frame.hold_steps) or (
                 self._steps >= self.frame.most_steps
             ):
@@ -137,6 +150,10 @@ class _Actor:
             self._held += bool(there)
             self._steps += 1
         return self._noisy((self.frame.position - gripper) / ACTION_SCALE_M, self.frame.fingers)
+
+    def _tolerance_m(self) -> float:
+        assert self.frame is not None
+        return self.frame.tolerance_m + _LEAST_EFFORT * self.aim.noise.action_std * ACTION_SCALE_M
 
     def _noisy(self, displacement: np.ndarray, fingers: float) -> np.ndarray:
         noise, rng = self.aim.noise, self.aim.rng
@@ -147,7 +164,8 @@ class _Actor:
             fingers = -fingers
         action = np.append(np.clip(displacement, -self.speed, self.speed), fingers)
         if noise.action_std:
-            action += rng.normal(0.0, noise.action_std, 4)
+            effort = max(_LEAST_EFFORT, float(np.abs(action[:3]).max()))
+            action += rng.normal(0.0, noise.action_std * effort, 4)
         return np.clip(action, -1.0, 1.0)
 
 

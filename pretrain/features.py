@@ -1,0 +1,120 @@
+"""What the networks see of (observation, goal).
+
+``PlainFeatures`` standardises and concatenates, as the paper does. ``ObjectFeatures`` uses that
+the goal is a set of places for objects: everything relative, the object to be moved first, and
+interchangeable objects in an order of their own, so that one skill serves them all.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from pretrain.layout import Layout
+
+_LENGTH_SCALE = 10.0
+"""Ten per metre: the table's decimetres become units."""
+_SPEED_SCALE = 2.0
+_SPIN_SCALE = 0.2
+
+
+class PlainFeatures(nn.Module):
+    """Standardised observation and goal, side by side."""
+
+    def __init__(self, layout: Layout, moments: dict[str, Tensor]) -> None:
+        super().__init__()
+        for name in ("observation_mean", "observation_std", "goal_mean", "goal_std"):
+            self.register_buffer(name, moments[name].clone())
+        self.size = layout.observation_dim + layout.goal_dim
+
+    def forward(self, observation: Tensor, goal: Tensor) -> Tensor:
+        """Return (B, size) features of (B, S) observations and (B, G) goals."""
+        state = (observation - self.observation_mean) / self.observation_std
+        target = (goal - self.goal_mean) / self.goal_std
+        return torch.cat([state, target], -1).clamp(-10, 10)
+
+
+class ObjectFeatures(nn.Module):
+    """The object that has the longest way to its goal first, the others by their distance to it.
+
+    Objects change places only with others of their kind.
+    """
+
+    def __init__(self, layout: Layout) -> None:
+        super().__init__()
+        self._layout = layout
+        self._interchangeable = layout.kinds == 1 and len(layout.objects) > 1
+        count = len(layout.objects)
+        self.size = layout.robot_dim + _TOKEN_DIM * count + 6 * (count - 1)
+        if not self._interchangeable:
+            self.size += count
+
+    def forward(self, observation: Tensor, goal: Tensor) -> Tensor:
+        """Return (B, size) features of (B, S) observations and (B, G) goals."""
+        robot = scaled_robot(observation[:, : self._layout.robot_dim])
+        tokens = object_tokens(self._layout, observation, goal)
+        way = tokens[..., _WAY].norm(dim=-1)
+        focus = way.argmax(1)
+        if self._interchangeable:
+            position = tokens[..., _POSITION]
+            anchor = position[torch.arange(len(focus)), focus]
+            apart = (position - anchor[:, None]).norm(dim=-1)
+            apart.scatter_(1, focus[:, None], -1.0)
+            order = apart.argsort(1)
+            tokens = tokens.gather(1, order[..., None].expand(-1, -1, tokens.shape[-1]))
+            extra = []
+        else:
+            extra = [nn.functional.one_hot(focus, tokens.shape[1]).to(tokens.dtype)]
+        position = tokens[..., _POSITION]
+        target = position[:, :1] + tokens[:, :1, _WAY]
+        others = [position[:, 1:] - position[:, :1], position[:, 1:] - target]
+        return torch.cat([robot, tokens.flatten(1), *[x.flatten(1) for x in others], *extra], -1)
+
+
+_TOKEN_DIM = 20
+_POSITION = slice(0, 3)
+_WAY = slice(6, 9)
+
+
+def scaled_robot(robot: Tensor) -> Tensor:
+    """Return the (B, 10) gripper features in the networks' units."""
+    position, fingers, velocity, finger_velocity = robot.split([3, 2, 3, 2], -1)
+    centred = position - position.new_tensor([0.31, 0.0, 0.1])
+    return torch.cat(
+        [
+            centred * _LENGTH_SCALE,
+            fingers * 4 * _LENGTH_SCALE,
+            velocity * _SPEED_SCALE,
+            finger_velocity * 2 * _SPEED_SCALE,
+        ],
+        -1,
+    )
+
+
+def object_tokens(layout: Layout, observation: Tensor, goal: Tensor) -> Tensor:
+    """Return (B, objects, 20): place, place from the gripper, way to the goal, tilt, turn, speeds.
+
+    A cube looks the same after a quarter turn, so the yaw enters as the sine and cosine of four
+    times itself; the last feature tells how long the way is.
+    """
+    starts = torch.tensor([item.observation for item in layout.objects])
+    features = observation[:, starts[:, None] + torch.arange(15)]
+    position, relative, euler, velocity, spin = features.split(3, -1)
+    goals = goal[:, torch.tensor([item.goal for item in layout.objects])[:, None] + torch.arange(3)]
+    way = (goals - position) * _LENGTH_SCALE
+    quarter = 4 * euler[..., 2:]
+    centred = position - position.new_tensor([0.31, 0.0, 0.05])
+    return torch.cat(
+        [
+            centred * _LENGTH_SCALE,
+            relative * _LENGTH_SCALE,
+            way,
+            euler[..., :2].clamp(-1, 1),
+            quarter.sin(),
+            quarter.cos(),
+            velocity * _SPEED_SCALE,
+            spin * _SPIN_SCALE,
+            way.norm(dim=-1, keepdim=True),
+        ],
+        -1,
+    ).clamp(-10, 10)
