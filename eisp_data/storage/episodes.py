@@ -1,0 +1,179 @@
+"""``meta/episodes``: one row per episode, saying where its rows and frames are.
+
+These files are the truth about which episodes a dataset holds: a batch is committed when its
+file appears, and ``info.json`` is only a summary that can be written again from them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from eisp_data.errors import DataError
+from eisp_data.storage.schema import CHUNK_SIZE, DATA_PATH, EPISODES_PATH, VIDEO_PATH, video_key
+from eisp_data.storage.stats import Stats
+
+POINTERS = ("episode_index", "length", "data/chunk_index", "data/file_index", "dataset_from_index")
+
+
+@dataclass(frozen=True)
+class EpisodeIndex:
+    """Where the E episodes of a dataset are; every array has one entry per episode, in order."""
+
+    root: Path
+    length: np.ndarray
+    """(E,) int64: rows, the T of the episode."""
+    data_file: np.ndarray
+    """(E, 2) int64: chunk and file index of the rows."""
+    first_row: np.ndarray
+    """(E,) int64: the episode's first ``index`` in the dataset."""
+    video_file: Mapping[str, np.ndarray]
+    """Camera to (E, 2) int64: chunk and file index of the frames."""
+    video_start_s: Mapping[str, np.ndarray]
+    """Camera to (E,) float64: where the episode begins in that file, seconds."""
+    tables: Sequence[Path]
+    """The files of ``meta/episodes`` that these rows came from."""
+    stale: Sequence[Path]
+    """Files of ``meta/episodes`` that only repeat earlier rows: an interrupted compaction."""
+
+    def __len__(self) -> int:
+        """Return E."""
+        return len(self.length)
+
+    def data_path(self, episode: int) -> Path:
+        """Return the parquet file of an episode's rows."""
+        chunk, file = self.data_file[episode]
+        return self.root / DATA_PATH.format(chunk_index=chunk, file_index=file)
+
+    def video_path(self, episode: int, camera: str) -> Path:
+        """Return the video of an episode's frames."""
+        chunk, file = self.video_file[camera][episode]
+        key = video_key(camera)
+        return self.root / VIDEO_PATH.format(video_key=key, chunk_index=chunk, file_index=file)
+
+
+def position(number: int) -> tuple[int, int]:
+    """Return the chunk and file index of the dataset's file ``number``, counted from 0."""
+    return number // CHUNK_SIZE, number % CHUNK_SIZE
+
+
+def read_parquet(path: Path, columns: list[str] | None = None) -> pa.Table:
+    """Read a parquet file whole; DataError naming it if it is missing, cut or damaged."""
+    try:
+        # One handle, one thread: a damaged page raises here instead of in a pool.
+        return pq.ParquetFile(path, memory_map=False).read(columns=columns, use_threads=False)
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such file") from None
+    except (OSError, pa.ArrowException, ValueError, KeyError) as error:
+        raise DataError(f"{path}: not a readable parquet file ({_first_line(error)})") from None
+
+
+def read_index(root: Path) -> EpisodeIndex:
+    """Read ``meta/episodes``; DataError if a file is damaged or episodes are missing."""
+    paths = sorted((root / "meta/episodes").glob("chunk-*/file-*.parquet"))
+    kept: list[pa.Table] = []
+    tables, stale = [], []
+    expected = 0
+    for path in paths:
+        table = read_parquet(path, _pointer_columns(path))
+        numbers = _integers(table, "episode_index", path)
+        if len(numbers) and numbers[-1] < expected:
+            stale.append(path)
+            continue
+        if not np.array_equal(numbers, np.arange(expected, expected + len(numbers))):
+            raise DataError(
+                f"{path}: episode_index: expected {expected} and upwards in steps of one; "
+                f"got {numbers[:5].tolist()}…"
+            )
+        expected += len(numbers)
+        kept.append(table)
+        tables.append(path)
+    return _collect(root, kept, tables, stale)
+
+
+def _collect(
+    root: Path, kept: list[pa.Table], tables: list[Path], stale: list[Path]
+) -> EpisodeIndex:
+    def column(name: str) -> np.ndarray:
+        parts = [_integers(table, name, path) for table, path in zip(kept, tables, strict=True)]
+        return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)
+
+    def seconds(name: str) -> np.ndarray:
+        parts = [table[name].to_numpy().astype(np.float64) for table in kept]
+        return np.concatenate(parts) if parts else np.zeros(0)
+
+    names = kept[0].column_names if kept else []
+    prefix, suffix = "videos/observation.images.", "/from_timestamp"
+    cameras = [n[len(prefix) : -len(suffix)] for n in names if n.endswith(suffix)]
+    return EpisodeIndex(
+        root=root,
+        length=column("length"),
+        data_file=np.stack([column("data/chunk_index"), column("data/file_index")], axis=-1),
+        first_row=column("dataset_from_index"),
+        video_file={
+            c: np.stack(
+                [column(f"{prefix}{c}/chunk_index"), column(f"{prefix}{c}/file_index")], axis=-1
+            )
+            for c in cameras
+        },
+        video_start_s={c: seconds(f"{prefix}{c}{suffix}") for c in cameras},
+        tables=tables,
+        stale=stale,
+    )
+
+
+def _pointer_columns(path: Path) -> list[str]:
+    try:
+        names = pq.read_schema(path).names
+    except (OSError, pa.ArrowException) as error:
+        raise DataError(f"{path}: not a readable parquet file ({_first_line(error)})") from None
+    missing = [name for name in POINTERS if name not in names]
+    if missing:
+        raise DataError(f"{path}: column(s) {missing} are missing")
+    return [*POINTERS, *(n for n in names if n.startswith("videos/observation.images."))]
+
+
+def _integers(table: pa.Table, name: str, path: Path) -> np.ndarray:
+    try:
+        column = table[name]
+        if column.null_count:
+            raise DataError(f"{path}: column {name} has empty cells")
+        return column.to_numpy().astype(np.int64, casting="same_kind")
+    except (KeyError, TypeError, pa.ArrowException):
+        raise DataError(f"{path}: column {name} is missing or does not hold integers") from None
+
+
+def _first_line(error: BaseException) -> str:
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
+
+
+def episode_table(
+    rows: Sequence[Mapping[str, Any]], stats: Sequence[Mapping[str, Stats]], number: int
+) -> pa.Table:
+    """Return the ``meta/episodes`` table of a batch.
+
+    Args:
+        rows: one mapping per episode, plain values, the same keys in each.
+        stats: one mapping per episode, column to its statistics.
+        number: which file of the dataset this will be.
+    """
+    chunk, file = position(number)
+    columns: dict[str, Any] = {name: [row[name] for row in rows] for name in rows[0]}
+    for name in stats[0]:
+        for stat in stats[0][name]:
+            columns[f"stats/{name}/{stat}"] = [s[name][stat].tolist() for s in stats]
+    columns["meta/episodes/chunk_index"] = [chunk] * len(rows)
+    columns["meta/episodes/file_index"] = [file] * len(rows)
+    return pa.table(columns)
+
+
+def episodes_path(root: Path, number: int) -> Path:
+    """Return the path of file ``number`` of ``meta/episodes``."""
+    chunk, file = position(number)
+    return root / EPISODES_PATH.format(chunk_index=chunk, file_index=file)

@@ -1,0 +1,89 @@
+"""Files that are either whole or not there: atomic replacement, and the lock of a writer."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from eisp_data.errors import DataError
+
+_LOCKED_HERE: set[str] = set()
+
+
+def sync(path: Path) -> None:
+    """Force a file or a folder's entries to the disk, so that a cut cable cannot undo them."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def replace_atomically(path: Path, write: Callable[[Path], object]) -> None:
+    """Call ``write(temporary)`` and move the result over ``path``, which is never half-written."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        write(temporary)
+        sync(temporary)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Replace ``path`` by ``value`` as indented JSON."""
+    text = json.dumps(value, indent=2, ensure_ascii=False) + "\n"
+    replace_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+
+
+def read_json(path: Path) -> Any:
+    """Return the JSON of ``path``; DataError if it is missing or not JSON."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such file") from None
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{path}: not valid JSON ({error})") from None
+
+
+class WriterLock:
+    """An exclusive claim on a folder that ends with the process, however it ends.
+
+    A POSIX record lock, because children made by ``fork`` do not inherit it: a killed collector
+    whose workers linger does not leave the dataset locked. It does not exclude a second writer
+    in the same process, so those are kept in a set.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._key = str(folder.resolve())
+        self._path = folder / ".writer.lock"
+        if self._key in _LOCKED_HERE:
+            raise DataError(f"{folder}: another writer of this process has this dataset open")
+        self._descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            fcntl.lockf(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # The owner before may have removed the file between our open and our lock.
+            if os.fstat(self._descriptor).st_nlink == 0:
+                raise BlockingIOError
+        except OSError:
+            owner = os.read(self._descriptor, 32).decode(errors="replace").strip()
+            os.close(self._descriptor)
+            raise DataError(
+                f"{folder}: process {owner or 'unknown'} is writing this dataset; "
+                "wait for it to end or write elsewhere"
+            ) from None
+        os.ftruncate(self._descriptor, 0)
+        os.write(self._descriptor, str(os.getpid()).encode())
+        _LOCKED_HERE.add(self._key)
+
+    def release(self) -> None:
+        """Give the folder up; a second call does nothing."""
+        if self._key in _LOCKED_HERE:
+            _LOCKED_HERE.discard(self._key)
+            self._path.unlink(missing_ok=True)
+            os.close(self._descriptor)

@@ -1,0 +1,271 @@
+"""Episodes out of a dataset, whole and bit-exact, also after LeRobot's tools have edited it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from eisp_data.episode import Episode
+from eisp_data.errors import DataError
+from eisp_data.storage.episodes import EpisodeIndex, read_index, read_parquet
+from eisp_data.storage.files import read_json
+from eisp_data.storage.meta import SIDECAR_PATH
+from eisp_data.storage.schema import SIDECAR_COLUMN, SIM_STATE_COLUMN, column_widths
+from eisp_data.storage.sidecar import Sidecar, decode
+from eisp_data.storage.spec import DatasetSpec
+from eisp_data.storage.video import decode_video
+
+
+@dataclass(frozen=True)
+class Block:
+    """The rows of consecutive episodes, as far as they share a data file."""
+
+    path: Path
+    first_episode: int
+    starts: np.ndarray
+    """(E + 1,) int64: where each episode begins in the columns, and the end of the last."""
+    columns: Mapping[str, np.ndarray]
+    """Numeric columns, each (N,) or (N, D), the dataset's dtype."""
+    sidecars: list[Sidecar]
+
+
+def check_version(root: Path) -> dict[str, Any]:
+    """Return ``info.json``; DataError unless it is a LeRobot v3 dataset."""
+    if not (root / "meta/info.json").is_file():
+        raise DataError(f"{root}: not a LeRobot dataset, meta/info.json is missing")
+    info = read_json(root / "meta/info.json")
+    version = info.get("codebase_version") if isinstance(info, dict) else None
+    if not isinstance(version, str) or not version.startswith("v3."):
+        raise DataError(f"{root}: dataset format {version!r}; only v3 can be read")
+    return info
+
+
+def read_spec(root: Path | str) -> DatasetSpec:
+    """Return the spec of a dataset."""
+    return _shared(Path(root))[0]
+
+
+def read_recipe(root: Path | str) -> dict[str, Any]:
+    """Return how a dataset was made.
+
+    Of a dataset that LeRobot merged from several, ``{"merged": [recipe, …]}``, each one once.
+    """
+    return _shared(Path(root))[1]
+
+
+def _shared(root: Path) -> tuple[DatasetSpec, dict[str, Any]]:
+    check_version(root)
+    path = root / SIDECAR_PATH
+    if path.exists():
+        stored = read_json(path)
+        try:
+            return DatasetSpec.from_json(stored["spec"]), dict(stored["recipe"])
+        except (KeyError, TypeError, ValueError):
+            raise DataError(f"{path}: spec or recipe is missing") from None
+    sidecars = read_sidecars(root, read_index(root))
+    if not sidecars:
+        raise DataError(f"{root}: holds no episodes")
+    recipes: list[dict[str, Any]] = []
+    for sidecar in sidecars:
+        recipes += [] if sidecar.recipe in recipes else [sidecar.recipe]
+    return sidecars[0].spec, recipes[0] if len(recipes) == 1 else {"merged": recipes}
+
+
+def read_sidecars(root: Path, index: EpisodeIndex) -> list[Sidecar]:
+    """Return the sidecar of every episode, without reading any other column."""
+    texts: list[Sidecar] = []
+    for first, stop in _runs(index):
+        path = index.data_path(first)
+        table = _read_rows(path, [SIDECAR_COLUMN, "episode_index"])
+        starts = _starts(table, path, index, first, stop)
+        texts += _sidecars(table, path, starts, first)
+    return texts
+
+
+def read_blocks(root: Path, spec: DatasetSpec) -> Iterator[Block]:
+    """Yield the rows of a dataset file by file, every column checked for shape and NaN.
+
+    Raises:
+        DataError: a file is missing, cut or damaged, a column is missing, of the wrong type or
+            not finite, or rows and ``meta/episodes`` disagree. Names file, column and episode.
+    """
+    index = read_index(root)
+    kinds = column_widths(spec)
+    for first, stop in _runs(index):
+        path = index.data_path(first)
+        table = _read_rows(path, [*kinds, SIDECAR_COLUMN])
+        starts = _starts(table, path, index, first, stop)
+        rows = slice(starts[0], starts[-1])
+        columns = {
+            name: _numbers(table, name, dtype, width, path)[rows]
+            for name, (dtype, width) in kinds.items()
+        }
+        for name, values in columns.items():
+            _check_finite(values, name, path, starts - starts[0], first)
+        sidecars = _sidecars(table, path, starts, first)
+        for number, sidecar in enumerate(sidecars):
+            if sidecar.spec.to_json() != spec.to_json():
+                raise DataError(f"{path}: episode {first + number} has another spec")
+        yield Block(path, first, starts - starts[0], columns, sidecars)
+
+
+def read_episodes(root: Path | str, images: bool = False) -> Iterator[Episode]:
+    """Yield the episodes of a dataset in order.
+
+    Args:
+        root: the dataset's folder.
+        images: decode the videos too; off, ``Episode.images`` is empty.
+    """
+    root = Path(root)
+    spec = read_spec(root)
+    index = read_index(root)
+    for block in read_blocks(root, spec):
+        for offset, sidecar in enumerate(block.sidecars):
+            rows = slice(block.starts[offset], block.starts[offset + 1])
+            number = block.first_episode + offset
+            frames = _images(index, number, sidecar, spec) if images else {}
+            try:
+                yield _episode({n: v[rows] for n, v in block.columns.items()}, sidecar, frames)
+            except DataError as error:
+                raise DataError(f"{block.path}: episode {number}: {error}") from None
+
+
+def _episode(
+    columns: Mapping[str, np.ndarray], sidecar: Sidecar, images: Mapping[str, np.ndarray]
+) -> Episode:
+    steps = len(columns["action"])
+    goals = columns["observation.desired_goal"].reshape(steps, -1)
+    if (goals != goals[0]).any():
+        raise DataError("observation.desired_goal changes within the episode")
+
+    def with_last(name: str, last: np.ndarray) -> np.ndarray:
+        return np.concatenate([_table(columns[name]), last[None]])
+
+    observation = with_last("observation.state", sidecar.observation[: sidecar.spec.proprio_dim])
+    if "observation.environment_state" in columns:
+        rest = sidecar.observation[sidecar.spec.proprio_dim :]
+        environment = with_last("observation.environment_state", rest)
+        observation = np.concatenate([observation, environment], axis=1)
+    states = columns.get(SIM_STATE_COLUMN, np.zeros((steps, 0)))
+    return Episode(
+        observation=observation,
+        achieved_goal=with_last("observation.achieved_goal", sidecar.achieved_goal),
+        desired_goal=goals[0].copy(),
+        action=_table(columns["action"]).copy(),
+        reward=columns["next.reward"].copy(),
+        done=columns["next.done"].copy(),
+        truncated=columns["next.truncated"].copy(),
+        success=np.concatenate([[sidecar.first_success], columns["next.success"]]),
+        sim_state=np.concatenate([_table(states), sidecar.sim_state[None]]),
+        seed=sidecar.seed,
+        info=sidecar.info,
+        images=images,
+    )
+
+
+def _images(
+    index: EpisodeIndex, number: int, sidecar: Sidecar, spec: DatasetSpec
+) -> dict[str, np.ndarray]:
+    images = {}
+    for camera in spec.cameras:
+        if camera not in index.video_file:
+            raise DataError(f"{index.root}: episode {number}: no video of camera {camera!r}")
+        start = round(float(index.video_start_s[camera][number]) * spec.fps)
+        stop = start + int(index.length[number])
+        frames = decode_video(index.video_path(number, camera), start, stop, spec.fps)
+        images[camera] = np.stack([*frames, sidecar.image(camera)])
+    return images
+
+
+def _table(values: np.ndarray) -> np.ndarray:
+    """Return (N,) or (N, D) as (N, D)."""
+    return values.reshape(len(values), -1) if values.ndim == 1 else values
+
+
+def _runs(index: EpisodeIndex) -> Iterator[tuple[int, int]]:
+    """Yield (first, stop) of the episodes that lie in one data file one after the other."""
+    first = 0
+    for episode in range(1, len(index) + 1):
+        if episode == len(index) or (index.data_file[episode] != index.data_file[first]).any():
+            yield first, episode
+            first = episode
+
+
+def _read_rows(path: Path, columns: list[str]) -> pa.Table:
+    try:
+        names = pq.read_schema(path).names
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such file") from None
+    except (OSError, pa.ArrowException) as error:
+        raise DataError(f"{path}: not a readable parquet file ({error})") from None
+    missing = [name for name in columns if name not in names]
+    if missing:
+        raise DataError(f"{path}: column(s) {missing} are missing")
+    return read_parquet(path, columns)
+
+
+def _starts(table: pa.Table, path: Path, index: EpisodeIndex, first: int, stop: int) -> np.ndarray:
+    """Return (E + 1,) row offsets of episodes ``first`` to ``stop - 1`` in a file's table."""
+    numbers = _numbers(table, "episode_index", "int64", 1, path)
+    begins = np.searchsorted(numbers, np.arange(first, stop + 1))
+    lengths = np.diff(begins)
+    wrong = np.flatnonzero(lengths != index.length[first:stop])
+    if len(wrong) or (np.diff(numbers) < 0).any():
+        episode = first + (int(wrong[0]) if len(wrong) else 0)
+        found = int((numbers == episode).sum())
+        raise DataError(
+            f"{path}: episode {episode}: {found} rows in order; meta/episodes says "
+            f"{index.length[episode]}"
+        )
+    return begins
+
+
+def _sidecars(table: pa.Table, path: Path, starts: np.ndarray, first: int) -> list[Sidecar]:
+    column = table[SIDECAR_COLUMN]
+    if not (pa.types.is_string(column.type) or pa.types.is_large_string(column.type)):
+        raise DataError(f"{path}: column {SIDECAR_COLUMN} does not hold text")
+    return [
+        decode(column[int(row)].as_py() or "", f"{path}: episode {first + number}")
+        for number, row in enumerate(starts[:-1])
+    ]
+
+
+def _numbers(table: pa.Table, name: str, dtype: str, width: int, path: Path) -> np.ndarray:
+    """Return a column as (N,), or (N, width) if wider; DataError if it is anything else."""
+    try:
+        column = table[name].combine_chunks()
+        if isinstance(column, pa.ChunkedArray):
+            column = pa.concat_arrays(column.chunks)
+        is_list = pa.types.is_list(column.type) or pa.types.is_large_list(column.type)
+        if is_list or pa.types.is_fixed_size_list(column.type):
+            column = column.flatten() if column.null_count == 0 else column
+        if column.null_count:
+            raise DataError(f"{path}: column {name} has empty cells")
+        values = column.to_numpy(zero_copy_only=False)
+    except pa.ArrowException as error:
+        raise DataError(f"{path}: column {name} cannot be read ({error})") from None
+    if values.dtype != np.dtype(dtype) or values.size != table.num_rows * width:
+        raise DataError(
+            f"{path}: column {name}: expected {width} x {dtype} a row; "
+            f"got {values.size / max(table.num_rows, 1):g} x {values.dtype}"
+        )
+    return values if width == 1 else values.reshape(-1, width)
+
+
+def _check_finite(
+    values: np.ndarray, name: str, path: Path, starts: np.ndarray, first: int
+) -> None:
+    if values.dtype.kind != "f" or np.isfinite(values).all():
+        return
+    row = int(np.argwhere(~np.isfinite(_table(values)))[0][0])
+    episode = int(np.searchsorted(starts, row, side="right")) - 1
+    raise DataError(
+        f"{path}: column {name}: not finite in episode {first + episode}, "
+        f"row {row - int(starts[episode])}"
+    )

@@ -1,0 +1,38 @@
+"""Small datasets for every test of the storage."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from storage_samples import random_episode, spec_of
+
+from eisp_data.episode import Episode
+from eisp_data.storage.writer import DatasetWriter
+
+
+@pytest.fixture(autouse=True)
+def _caches_beside_the_data(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("EISP_CACHE", raising=False)
+
+
+@pytest.fixture
+def make_dataset(tmp_path: Path) -> Callable[..., tuple[Path, list[Episode]]]:
+    """Return a function that writes a dataset in two batches and returns it with its episodes."""
+
+    def make(
+        name: str = "dataset",
+        count: int = 5,
+        seed: int = 0,
+        cameras: bool = False,
+        **changes: object,
+    ) -> tuple[Path, list[Episode]]:
+        spec = spec_of(cameras, **changes)
+        episodes = [random_episode(spec, 6 + i, seed + i) for i in range(count)]
+        with DatasetWriter(tmp_path / name, spec, {"policy": "script", "seed": seed}) as writer:
+            writer.write(episodes[:2])
+            writer.write(episodes[2:])
+        return tmp_path / name, episodes
+
+    return make
