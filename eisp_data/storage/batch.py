@@ -55,13 +55,16 @@ class Batch:
 
     def stats(self) -> list[dict[str, Stats]]:
         """Return each episode's statistics of every column and camera, ``index`` still missing."""
-        return [
-            {
-                **{name: column_stats(values) for name, values in columns.items()},
-                **{video_key(c): image_stats(f[:-1]) for c, f in episode.images.items()},
-            }
-            for columns, episode in zip(self.columns, self.episodes, strict=True)
-        ]
+        stats: list[dict[str, Stats]] = [{} for _ in self.episodes]
+        for name in self.columns[0]:
+            for own, column in zip(
+                stats, column_stats([c[name] for c in self.columns]), strict=True
+            ):
+                own[name] = column
+        for own, episode in zip(stats, self.episodes, strict=True):
+            for camera, frames in episode.images.items():
+                own[video_key(camera)] = image_stats(frames[:-1])
+        return stats
 
 
 def prepare(
@@ -178,7 +181,7 @@ def stage(
     staged.append((data, Path(DATA_PATH.format(chunk_index=chunk, file_index=file))))
     rows: list[dict[str, object]] = []
     for episode, columns, own in zip(batch.episodes, batch.columns, stats, strict=True):
-        own["index"] = column_stats(first_row + columns["frame_index"])
+        [own["index"]] = column_stats([first_row + columns["frame_index"]])
         rows.append(_pointers(episode, columns, spec, first_row, number, rows))
         first_row += len(episode)
     table = staging / "episodes.parquet"
@@ -211,8 +214,7 @@ def _write_rows(batch: Batch, path: Path, first_row: int) -> None:
     with pq.ParquetWriter(
         path,
         table.schema,
-        compression="zstd",
-        compression_level=1,
+        compression="snappy",
         use_dictionary=[n for n in table.column_names if n not in plain],
     ) as writer:
         # One row group per episode, as LeRobot's writer does, for reading at random.
