@@ -14,7 +14,7 @@ from typing import NamedTuple
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Header, Schema
+from mcap.records import Channel, Header, Metadata, Schema
 
 from eisp_data.errors import DataError
 from eisp_data.storage.mcap import records, scan
@@ -175,6 +175,18 @@ class McapLog:
                 continue
             self._file.seek(offset + records.RECORD_HEADER.size)
             yield opcode, self._file.read(length - records.RECORD_HEADER.size)
+
+    def metadata(self) -> dict[str, dict[str, str]]:
+        """Return the metadata records by name; damaged ones are left out."""
+        found = {}
+        for opcode, body in self.extras():
+            if opcode == Opcode.METADATA:
+                try:
+                    record = Metadata.read(ReadDataStream(io.BytesIO(body)))
+                except (McapError, struct.error, UnicodeDecodeError):
+                    continue
+                found[record.name] = record.metadata
+        return found
 
     def header(self) -> tuple[str, str]:
         """Return profile and library of the header, both empty if it is damaged."""

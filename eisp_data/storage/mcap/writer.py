@@ -77,6 +77,9 @@ class WriterStats:
     """Topic to messages for which the queue had no room."""
 
 
+_NOT_A_NAME = ("", "camera", "color", "image", "image_raw", "image_rect", "compressed")
+
+
 @dataclass(frozen=True, slots=True)
 class Picture:
     """An image in the queue: JPEG bytes, or (H, W, 3) uint8 RGB still to be compressed."""
@@ -84,9 +87,9 @@ class Picture:
     image: np.ndarray | bytes
 
 
-def _camera(topic: str) -> str:
+def camera_name(topic: str) -> str:
     """Return the camera's name: ``top`` for ``/camera/top/image`` as for ``/top``."""
-    parts = [part for part in topic.split("/") if part not in ("", "camera", "image", "compressed")]
+    parts = [part for part in topic.split("/") if part not in _NOT_A_NAME]
     return "_".join(parts) or "camera"
 
 
@@ -176,7 +179,12 @@ class McapWriter:
         size = len(image) if isinstance(image, bytes) else image.nbytes
         kind = messages.foxglove_class("CompressedImage")
         return self._put(
-            topic, Picture(image), size, kind, publish_time_ns, f"image.{_camera(topic)}"
+            topic,
+            Picture(image),
+            size,
+            kind,
+            publish_time_ns,
+            f"observation.images.{camera_name(topic)}",
         )
 
     def vector(
@@ -265,7 +273,7 @@ class McapWriter:
             jpeg = data.image
             if isinstance(jpeg, np.ndarray):
                 jpeg = messages.encode_jpeg(jpeg, self.config.jpeg_quality)
-            message = messages.image(jpeg, item.publish_time_ns, _camera(item.topic))
+            message = messages.image(jpeg, item.publish_time_ns, camera_name(item.topic))
             data = message.SerializeToString()
         if item.topic not in self._channels:
             self._channels[item.topic] = self._register(item.topic)

@@ -1,0 +1,86 @@
+"""Loading what a mapping names from a recording: numbers whole, images by their times only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from eisp_data.errors import DataError
+from eisp_data.storage.mcap import decode, pixels
+from eisp_data.storage.mcap.collect import LAST_TIME_NS, Clock, Collector, Source, time_of
+from eisp_data.storage.mcap.mapping import Mapping
+from eisp_data.storage.mcap.reader import Entry, McapLog
+
+
+@dataclass
+class Recording:
+    """What one file holds of a mapping."""
+
+    sources: list[Source]
+    events: list[decode.Event]
+    """In the order of their times, which are set."""
+
+
+def load(log: McapLog, mapping: Mapping, clock: Clock) -> Recording:
+    """Read all that ``mapping`` names from ``log`` in one pass, but no image.
+
+    Raises DataError if a topic is missing, empty, or cannot be decoded.
+    """
+    topics = {stream.topic for stream in mapping.streams}
+    for topic in sorted(topics):
+        if topic not in log.topics and _needed(mapping, topic):
+            known = ", ".join(sorted(log.topics)) or "none"
+            raise DataError(f"{log.path}: no channel {topic}; it has {known}")
+    collectors = [Collector(s) for s in mapping.streams if s.to != "events"]
+    by_topic: dict[str, list[Collector]] = {topic: [] for topic in topics}
+    for collector in collectors:
+        by_topic[collector.stream.topic].append(collector)
+    event_topics = {s.topic for s in mapping.streams if s.to == "events"}
+    decoder, events = decode.Decoder(), []
+    for entry in log.messages(topics, in_order=False):
+        decoded = decoder.decode(entry.channel, log.schema_of(entry.channel), entry.message.data)
+        if entry.topic in event_topics and isinstance(decoded, decode.Event):
+            events.append(_timed(decoded, entry, clock))
+        for collector in by_topic[entry.topic]:
+            collector.add(entry, decoded, clock)
+    events.sort(key=lambda event: event.time_ns or 0)
+    try:
+        return Recording([collector.source() for collector in collectors], events)
+    except DataError as error:
+        raise DataError(f"{log.path}: {error}") from None
+
+
+def _needed(mapping: Mapping, topic: str) -> bool:
+    """Return whether the conversion cannot do without ``topic``: without events it can."""
+    return any(s.topic == topic and s.to != "events" for s in mapping.streams)
+
+
+def _timed(event: decode.Event, entry: Entry, clock: Clock) -> decode.Event:
+    at = min(time_of(entry, event.time_ns, clock), LAST_TIME_NS)
+    return decode.Event(at, event.kind, event.details)
+
+
+def fetch_images(log: McapLog, source: Source, chosen: np.ndarray, clock: Clock) -> np.ndarray:
+    """Return the images (K, H, W, 3) uint8 RGB of the samples ``chosen`` (K,) of ``source``."""
+    if source.image_size is None:
+        raise DataError(f"{source.stream.topic}: not a channel of images")
+    frames = np.empty((len(chosen), *source.image_size, 3), np.uint8)
+    found = np.zeros(len(chosen), bool)
+    rows: dict[int, list[int]] = {}
+    for row, sample in enumerate(chosen):
+        rows.setdefault(int(source.series.times_ns[sample]), []).append(row)
+    logged = source.log_times_ns[chosen]
+    decoder = decode.Decoder()
+    start, end = int(logged.min()), int(logged.max()) + 1
+    for entry in log.messages({source.stream.topic}, start, end, in_order=False):
+        picture = decoder.decode(entry.channel, log.schema_of(entry.channel), entry.message.data)
+        if not isinstance(picture, decode.Picture):
+            continue
+        at = rows.get(time_of(entry, picture.time_ns, clock))
+        if at is not None:
+            frames[at] = pixels.rgb(picture, source.image_size)
+            found[at] = True
+    if not found.all():
+        raise DataError(f"{log.path}: {source.stream.topic} changed while it was read")
+    return frames
