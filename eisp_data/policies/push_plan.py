@@ -74,6 +74,13 @@ def way_for_pusher(start: np.ndarray, end: np.ndarray, blocks: np.ndarray) -> bo
     return not on_the_way(start, end, blocks, half[:, None]).any()
 
 
+def is_behind(pusher: np.ndarray, block: np.ndarray, normal: np.ndarray) -> bool:
+    """Return whether a pusher at (2,) is still behind the face of the block that it pushes."""
+    offset = block - pusher
+    aside = np.abs(offset - (offset @ normal) * normal).max()
+    return bool(offset @ normal > 0.7 * BESIDE_M and aside < 0.8 * BESIDE_M)
+
+
 def _order(blocks: np.ndarray, targets: np.ndarray, todo: tuple[int, ...]) -> list[int] | None:
     """Return an order of straight pushes, by number where there is a choice; None if none works."""
     obstacles = {

@@ -32,23 +32,26 @@ class Physics:
         self._pool = Rollout(nthread=threads if threads > 1 else 0)
 
     def step(self, state: np.ndarray, control: np.ndarray) -> np.ndarray:
-        """Hold one control for one control period in every world.
+        """Apply one control for one control period in every world.
 
         Args:
             state: (N, P) float64.
-            control: (N, U) float64, in the units of the model's actuators.
+            control: (N, U) float64, in the units of the model's actuators, held for the whole
+                period; or (N, SUBSTEPS, U), one for each time step.
 
         Returns:
             (N, P) float64, the states SUBSTEPS time steps later.
         """
         worlds = len(state)
+        if control.ndim == 2:
+            control = np.repeat(control[:, None], SUBSTEPS, axis=1)
         path = np.empty((worlds, SUBSTEPS, self.state_dim))
         sensors = np.empty((worlds, SUBSTEPS, self.model.nsensordata))
         self._pool.rollout(
             [self.model] * worlds,
             self._data,
             np.ascontiguousarray(state, dtype=np.float64),
-            np.repeat(control[:, None], SUBSTEPS, axis=1),
+            control,
             nstep=SUBSTEPS,
             state=path,
             sensordata=sensors,
