@@ -79,8 +79,9 @@ class StreamMap:
     0 keeps them, with the age in its column."""
 
     def __post_init__(self) -> None:
-        image, extra = self.to.startswith(IMAGE), self.to.startswith(EXTRA)
-        if self.to not in ROLES and not (image and self.to != IMAGE or extra and self.to != EXTRA):
+        image = self.to.startswith(IMAGE)
+        named = any(self.to.startswith(front) and self.to != front for front in (IMAGE, EXTRA))
+        if self.to not in ROLES and not named:
             raise ConfigError(
                 f"{self.topic}: to: {self.to!r}; choose one of {', '.join(ROLES)}, "
                 f"{IMAGE}<camera>, {EXTRA}<column>"

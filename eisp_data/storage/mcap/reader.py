@@ -14,7 +14,7 @@ from typing import NamedTuple
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Header, Metadata, Schema
+from mcap.records import Channel, Header, Metadata, Schema, Statistics
 
 from eisp_data.errors import DataError
 from eisp_data.storage.mcap import records, scan
@@ -80,6 +80,8 @@ class McapLog:
             raise
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
+        self.statistics: Statistics | None = None
+        """What the summary says the file holds."""
         self._bad_segments: dict[Segment, str] = {}
         self._unknown: dict[int, int] = {}
         self.indexed = self._read_summary()
@@ -229,6 +231,8 @@ class McapLog:
         try:
             for opcode, body in scan.summary_records(self._file):
                 self._define(opcode, body)
+                if opcode == Opcode.STATISTICS:
+                    self.statistics = records.parse_statistics(body)
         except BadRecord as error:
             self.layout.problems.append(f"summary: {error}")
             self.schemas.clear()

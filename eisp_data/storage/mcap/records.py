@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Schema
+from mcap.records import Channel, Schema, Statistics
 
 from eisp_data.errors import DataError
 
@@ -149,6 +149,14 @@ def parse_message(body: bytes) -> Message:
         raise BadRecord("message too short")
     channel, sequence, log_time_ns, publish_time_ns = MESSAGE_HEADER.unpack_from(body)
     return Message(channel, sequence, log_time_ns, publish_time_ns, body[MESSAGE_HEADER.size :])
+
+
+def parse_statistics(body: bytes) -> Statistics:
+    """Parse the body of a statistics record."""
+    try:
+        return Statistics.read(ReadDataStream(io.BytesIO(body)))
+    except (McapError, struct.error) as error:
+        raise BadRecord(f"statistics: {error or 'cut short'}") from None
 
 
 def parse_definition(opcode: int, body: bytes) -> Schema | Channel:
