@@ -33,20 +33,29 @@ _SCENE = """
   <option timestep="{timestep}" integrator="implicitfast" cone="elliptic" impratio="5"/>
   <size memory="4M"/>
   <visual>
-    <headlight ambient="0.45 0.45 0.45" diffuse="0.45 0.45 0.45" specular="0 0 0"/>
+    <headlight ambient="0.42 0.42 0.42" diffuse="0.28 0.28 0.28" specular="0 0 0"/>
     <global offwidth="640" offheight="480"/>
-    <quality shadowsize="2048"/>
+    <quality shadowsize="4096" offsamples="8"/>
+    <map shadowclip="0.6"/>
   </visual>
+  <asset>
+    <texture type="skybox" builtin="gradient" rgb1="0.95 0.96 0.97" rgb2="0.72 0.77 0.82"
+             width="64" height="384"/>
+    <texture name="grain" type="2d" builtin="checker" rgb1="0.80 0.77 0.72" rgb2="0.78 0.75 0.70"
+             width="256" height="256"/>
+    <material name="table" texture="grain" texrepeat="6 7" specular="0.1"/>
+  </asset>
   <default>
     <geom friction="0.7 0.01 0.0001" solref="0.008 1" condim="4"/>
     <default class="pad"><geom friction="1.5 0.02 0.0001" priority="1"/></default>
     <default class="visual"><geom contype="0" conaffinity="0" mass="0"/></default>
   </default>
   <worldbody>
-    <light pos="0.1 0.3 1.2" dir="0.15 -0.2 -1" diffuse="0.5 0.5 0.5"/>
-    <camera name="front" pos="1.02 0 0.62" xyaxes="0 1 0 -0.68 0 0.73" fovy="40"/>
-    <camera name="top" pos="0.33 0 0.85" xyaxes="0 -1 0 1 0 0" fovy="40"/>
-    <geom name="table" type="box" pos="0.35 0 -0.1" size="0.30 0.36 0.1" rgba="0.87 0.84 0.78 1"/>
+    <light pos="0.05 -0.25 1.1" dir="0.22 0.18 -1" diffuse="0.52 0.52 0.50"/>
+    <camera name="front" pos="-0.26 -0.36 0.55" fovy="36"
+            xyaxes="0.5177 -0.8556 0 0.5027 0.3042 0.8092"/>
+    <camera name="top" pos="0.33 0 0.85" xyaxes="0 -1 0 1 0 0" fovy="32"/>
+    <geom name="table" type="box" pos="0.35 0 -0.1" size="0.30 0.36 0.1" material="table"/>
     <body name="gripper" gravcomp="1">
       <joint name="gripper_x" type="slide" axis="1 0 0" armature="0.2"/>
       <joint name="gripper_y" type="slide" axis="0 1 0" armature="0.2"/>

@@ -22,7 +22,8 @@ def on_the_way(
         start: (..., 2) metres.
         end: (..., 2) metres.
         others: (..., 2) metres, the centres of squares of 2 * half_m, broadcast with the segments.
-        half_m: half the edge of a square, or (..., 1) of each: the sum of two half widths asks about two bodies.
+        half_m: half the edge of a square, or (..., 1) of each; the sum of two half widths asks
+            about two bodies.
 
     Returns:
         (...) bool.
