@@ -40,18 +40,22 @@ def record_session(
             writer.event("episode_start", start, policy="script")
             goal = [float(episode), 0.0, 0.1]
             writer.vector("/goal", goal, start, role="observation.desired_goal")
-            for at in range(start - 20 * MS, end + 20 * MS, 10 * MS):
-                angle = float(joint_angle(at))
-                writer.log("/joint_states", messages.joints(["a", "b"], [angle, 1.0], at), at)
-            for at in range(start - 50 * MS, end, 100 * MS):
-                place = [float(joint_angle(at)), 0.0, 0.0]
-                poses = {"block": (place, [1.0, 0, 0, 0])}
-                writer.log("/objects", messages.transforms(poses, at), at)
-            if camera:
-                for k, at in enumerate(range(start - 30 * MS, end, 50 * MS)):
-                    writer.image("/camera/top/image", np.full((32, 48, 3), 10 * k, np.uint8), at)
-            for k in range(steps):
-                at = start + k * PERIOD_NS
-                writer.vector("/command", [k / 100, -k / 100], at, role="action")
+            for at in range(start - 50 * MS, end + 20 * MS, 10 * MS):
+                _record_instant(writer, at, at - start, steps, camera)
             writer.event("episode_end", end, outcome=outcome)
     return path
+
+
+def _record_instant(writer: McapWriter, at: int, since: int, steps: int, camera: bool) -> None:
+    """Record what falls on one time, ``since`` nanoseconds after the start of the episode."""
+    angle, end = float(joint_angle(at)), steps * PERIOD_NS
+    writer.log("/joint_states", messages.joints(["a", "b"], [angle, 1.0], at), at)
+    if (since + 50 * MS) % (100 * MS) == 0 and since < end:
+        poses = {"block": ([angle, 0.0, 0.0], [1.0, 0, 0, 0])}
+        writer.log("/objects", messages.transforms(poses, at), at)
+    if camera and since >= -30 * MS and (since + 30 * MS) % (50 * MS) == 0 and since < end:
+        grey = 10 * (since + 30 * MS) // (50 * MS)
+        writer.image("/camera/top/image", np.full((32, 48, 3), grey, np.uint8), at)
+    if since >= 0 and since % PERIOD_NS == 0 and since < end:
+        k = since // PERIOD_NS
+        writer.vector("/command", [k / 100, -k / 100], at, role="action")
