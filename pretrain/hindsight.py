@@ -6,8 +6,8 @@ T + 1 achieved goals) into waypoints:
 ``evenly``, the paper's: every T / n steps. With T = 12 and n = 4 the waypoints are 3, 6, 9 and 12.
 
 ``at_rest``, ours: where the objects have come to rest between two moves. If block 0 moves during
-steps 2 to 5 and block 1 during steps 8 to 11, the waypoints are 6, 12 and the end of the
-trajectory: stable arrangements, each one move of one object away from the one before.
+steps 2 to 5 and block 1 during steps 10 to 13, the waypoints are 6 and 14: stable arrangements,
+each one move away from the one before.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def moves(achieved_goal: np.ndarray) -> list[Move]:
         achieved_goal: (T + 1, G), three coordinates an object in metres.
 
     Returns:
-        The moves in time; consecutive moves of the same objects count as one, because a push
+        The moves in time, but for one that the end of the trajectory cuts off; consecutive moves of the same objects count as one, because a push
         that is re-aimed is still one push.
     """
     places = achieved_goal.reshape(len(achieved_goal), -1, 3)
@@ -54,6 +54,8 @@ def moves(achieved_goal: np.ndarray) -> list[Move]:
     for start, end in _runs(steps):
         way = np.linalg.norm(places[end] - places[start], axis=-1)
         moved = frozenset(np.flatnonzero(way > _MOVED_M).tolist())
+        if end == len(steps):
+            break
         if moved and found and found[-1].objects == moved:
             found.pop()
         if moved:
@@ -64,7 +66,7 @@ def moves(achieved_goal: np.ndarray) -> list[Move]:
 def _runs(moving: np.ndarray) -> list[tuple[int, int]]:
     """Return (start, end) of the runs of True; pauses of up to _PAUSE_STEPS are bridged.
 
-    [F F T T F T F F F F F T T] has the runs (2, 6) and (11, 13).
+    [F F T T F T F F F F F T T F] has the runs (2, 6) and (11, 13).
     """
     runs: list[tuple[int, int]] = []
     for index in np.flatnonzero(moving).tolist():
@@ -119,6 +121,26 @@ class Waypoints:
         first = self.following[rows]
         last = first + rng.integers(0, self.beyond[first] - first)
         return self.row[first], self.row[last]
+
+    def joined(self, later: Waypoints) -> Waypoints:
+        """Return these waypoints and those of rows that come after."""
+        rows, count = len(self.following), len(self.row)
+        moved = np.where(later.following < 0, -1, later.following + count)
+        return Waypoints(
+            np.concatenate([self.row, later.row + rows]),
+            np.concatenate([self.following, moved]),
+            np.concatenate([self.beyond, later.beyond + count]),
+        )
+
+    def without_first(self, rows: int) -> Waypoints:
+        """Return the waypoints without those of the first rows, which are whole episodes."""
+        gone = int(np.searchsorted(self.row, rows))
+        following = self.following[rows:]
+        return Waypoints(
+            self.row[gone:] - rows,
+            np.where(following < 0, -1, following - gone),
+            self.beyond[gone:] - gone,
+        )
 
 
 def find_waypoints(

@@ -54,7 +54,7 @@ class Noise:
     """Probability, per step, that the fingers do the opposite for a few steps."""
     partial: bool = False
     """Whether the script does a random part of the task only (a random level of the goal)."""
-    whole_share: float = 0.1
+    whole_share: float = 0.05
     """Share of the partial scripts that attempt the whole task all the same."""
     least_s: float = 4.0
     """A partial script that is done earlier goes on with parts at places of its own; 4 s are the

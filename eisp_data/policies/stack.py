@@ -26,7 +26,7 @@ def stack(view: View, aim: Aim) -> Iterator[Keyframe]:
     elif aim.rng.random() < 0.5:
         yield from _build(view, aim, view.goal[: aim.rng.integers(1, len(view.goal))])
     while view.time_s < aim.noise.least_s:
-        offset = np.append(_free_place(view, aim) - view.goal[0, :2], 0.0)
+        offset = np.append(_free_place(view, aim, view.goal[:1, :2]) - view.goal[0, :2], 0.0)
         yield from _build(view, aim, view.goal + offset)
 
 
@@ -60,6 +60,5 @@ def _obstacle(view: View, block: int, target: np.ndarray) -> int | None:
     return None
 
 
-def _free_place(view: View, aim: Aim, taken: np.ndarray | None = None) -> np.ndarray:
-    places = view.blocks[:, :2] if taken is None else np.vstack([view.blocks[:, :2], taken])
-    return scatter(aim.rng, 1, _FREE_M, taken=places)[0]
+def _free_place(view: View, aim: Aim, taken: np.ndarray) -> np.ndarray:
+    return scatter(aim.rng, 1, _FREE_M, taken=np.vstack([view.blocks[:, :2], taken]))[0]

@@ -48,6 +48,30 @@ class Worlds:
         self.state = self._physics.step(self.state, self.task.control(self.state, action))
         self.steps += 1
 
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """Return all that ``restore_snapshot`` needs to go on from here."""
+        return {"state": self.state, "desired_goal": self.desired_goal, "steps": self.steps}
+
+    def restore_snapshot(self, arrays: dict[str, np.ndarray]) -> None:
+        """Go on from a snapshot."""
+        self.state, self.desired_goal = arrays["state"], arrays["desired_goal"]
+        self.steps = arrays["steps"]
+
+    @property
+    def name(self) -> str:
+        """The task's."""
+        return self.task.name
+
+    @property
+    def episode_steps(self) -> int:
+        """L."""
+        return self.task.paper.episode_steps
+
+    @property
+    def settled(self) -> np.ndarray:
+        """(N,) bool: all is at rest and let go of."""
+        return self.task.settled(self.state)
+
     @property
     def observation(self) -> np.ndarray:
         """(N, S) float32."""
@@ -66,4 +90,4 @@ class Worlds:
     @property
     def truncated(self) -> np.ndarray:
         """(N,) bool: the episode has had its L steps."""
-        return self.steps >= self.task.paper.episode_steps
+        return self.steps >= self.episode_steps

@@ -1,0 +1,180 @@
+"""How good a policy is: success, return and subgoals over fresh episodes, with intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from eisp_data.policies.registry import SCRIPTS
+from eisp_data.policies.script import Noise, ScriptedPolicy
+from eisp_data.sim.worlds import Worlds
+from eisp_data.tasks.registry import TASKS
+from finetune.rollout import SubgoalPolicy
+from pretrain.agent import Agent
+
+_Z = 1.959963984540054
+"""Quantile of the normal distribution for a 95% interval."""
+_EDGES_M = tuple(round(0.1 * i, 1) for i in range(11))
+"""The ranges of the paper's failure analysis; the last is open."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean with its 95% interval."""
+
+    mean: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{self.mean:.3g} [{self.low:.3g}, {self.high:.3g}]"
+
+
+@dataclass(frozen=True)
+class Distances:
+    """Episodes by the distance between their last subgoal and what was achieved at the end."""
+
+    edges: tuple[float, ...]
+    """Lower ends of the ranges, m; the last range is open."""
+    failures: tuple[int, ...]
+    successes: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What ``evaluate`` found."""
+
+    task: str
+    episodes: int
+    seed: int
+    success_last: Estimate
+    """The goal is met at the last step."""
+    success_settled: Estimate | None
+    """And all is at rest and let go of; None outside our own tasks."""
+    success_any: Estimate
+    """The goal was met at some step."""
+    return_: Estimate
+    relative_return: Estimate | None
+    """(R + L) / (R_oracle + L); None where there is no oracle."""
+    oracle_return: float | None
+    paper_return: float | None
+    subgoal_distance: Distances
+
+    def to_plain(self) -> dict[str, object]:
+        """Return JSON values."""
+        from eisp_data.config import to_plain
+
+        plain = to_plain(self)
+        plain["return"] = plain.pop("return_")
+        return plain
+
+
+def evaluate(
+    agent: Agent,
+    worlds: Worlds,
+    episodes: int,
+    seed: int,
+    *,
+    oracle: float | None = None,
+    device: str = "cpu",
+    watch: Callable[[Worlds, SubgoalPolicy], None] | None = None,
+) -> Evaluation:
+    """Run the policy without exploration.
+
+    Args:
+        agent: the policy.
+        worlds: a batch to run it in.
+        episodes: how many; they have the seeds ``seed``, ``seed + 1`` and so on.
+        seed: the first.
+        oracle: mean return of the oracle, for the relative return.
+        device: where the agent is.
+        watch: called with worlds and policy after every step of the first batch.
+    """
+    parts = []
+    for first in range(0, episodes, worlds.count):
+        parts.append(_batch(agent, worlds, seed + first, device, watch if first == 0 else None))
+    last, settled, some, returns, distance = (
+        np.concatenate(column)[:episodes] for column in zip(*parts, strict=True)
+    )
+    length = worlds.episode_steps
+    relative = None
+    if oracle is not None:
+        relative = mean_interval((returns + length) / (oracle + length))
+    counts = [
+        np.histogram(distance[chosen], bins=[*_EDGES_M, np.inf])[0] for chosen in (~last, last)
+    ]
+    task = TASKS.get(worlds.name)
+    return Evaluation(
+        task=worlds.name,
+        episodes=episodes,
+        seed=seed,
+        success_last=share_interval(last),
+        success_settled=share_interval(settled) if task else None,
+        success_any=share_interval(some),
+        return_=mean_interval(returns),
+        relative_return=relative,
+        oracle_return=oracle,
+        paper_return=task.paper.expected_return if task else None,
+        subgoal_distance=Distances(
+            _EDGES_M, *(tuple(int(count) for count in each) for each in counts)
+        ),
+    )
+
+
+def _batch(
+    agent: Agent,
+    worlds: Worlds,
+    seed: int,
+    device: str,
+    watch: Callable[[Worlds, SubgoalPolicy], None] | None,
+) -> tuple[np.ndarray, ...]:
+    worlds.reset(range(seed, seed + worlds.count))
+    policy = SubgoalPolicy(agent, worlds.count, device)
+    returns = np.zeros(worlds.count)
+    some = worlds.success
+    for _ in range(worlds.episode_steps):
+        action = policy.act(
+            worlds.observation, worlds.achieved_goal, worlds.desired_goal, explore=False
+        )
+        worlds.step(action)
+        returns += worlds.success - 1.0
+        some |= worlds.success
+        if watch:
+            watch(worlds, policy)
+    distance = np.linalg.norm(worlds.achieved_goal - policy.subgoal, axis=1)
+    return worlds.success, worlds.success & worlds.settled, some, returns, distance
+
+
+def oracle_return(name: str, episodes: int, seed: int) -> float | None:
+    """Return the mean return of the noise-free script on these seeds; None if there is none."""
+    if name not in SCRIPTS:
+        return None
+    task = TASKS[name]
+    worlds = Worlds(task, episodes)
+    worlds.reset(range(seed, seed + episodes))
+    policy = ScriptedPolicy(task, SCRIPTS[name], Noise(), episodes)
+    for world in range(episodes):
+        policy.begin(world, worlds.state, worlds.desired_goal[world], seed + world)
+    total = 0.0
+    for _ in range(worlds.episode_steps):
+        worlds.step(policy.act(worlds.state))
+        total += float((worlds.success - 1.0).sum())
+    return total / episodes
+
+
+def share_interval(hits: np.ndarray) -> Estimate:
+    """Return the share of True with its Wilson interval (Wilson 1927)."""
+    count, share = len(hits), float(hits.mean())
+    centre = (share + _Z**2 / (2 * count)) / (1 + _Z**2 / count)
+    spread = share * (1 - share) / count + _Z**2 / (4 * count**2)
+    half = _Z * float(np.sqrt(spread)) / (1 + _Z**2 / count)
+    return Estimate(share, max(0.0, centre - half), min(1.0, centre + half))
+
+
+def mean_interval(values: np.ndarray) -> Estimate:
+    """Return the mean with its normal interval."""
+    mean = float(values.mean())
+    half = _Z * float(values.std(ddof=1)) / float(np.sqrt(len(values))) if len(values) > 1 else 0.0
+    return Estimate(mean, mean - half, mean + half)

@@ -1,0 +1,80 @@
+"""The rollout with subgoals (the paper's Algorithm 1), for training, evaluation and deployment."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from finetune.selector import select
+from pretrain.agent import Agent
+
+
+class SubgoalPolicy:
+    """Acts in N worlds at once, each with a subgoal of its own.
+
+    Attributes:
+        subgoal: (N, G) float32, what each world is heading for.
+        age: (N,) int64, steps for which it has been.
+    """
+
+    def __init__(self, agent: Agent, worlds: int, device: str = "cpu") -> None:
+        self._agent, self._device = agent, device
+        self._config = agent.config.subgoals
+        self.subgoal = np.zeros((worlds, agent.layout.goal_dim), np.float32)
+        self.age = np.full(worlds, self._config.every_steps)
+
+    def reset(self, worlds: np.ndarray) -> None:
+        """Forget the subgoals of the named worlds."""
+        self.age[worlds] = self._config.every_steps
+
+    @torch.no_grad()
+    def act(
+        self,
+        observation: np.ndarray,
+        achieved_goal: np.ndarray,
+        desired_goal: np.ndarray,
+        *,
+        explore: bool,
+    ) -> np.ndarray:
+        """Renew the subgoals that are reached or too old, and return actions towards them.
+
+        Args:
+            observation: (N, S).
+            achieved_goal: (N, G).
+            desired_goal: (N, G).
+            explore: sample actions instead of taking their mean.
+
+        Returns:
+            (N, A) float32 in [-1, 1].
+        """
+        reached = np.linalg.norm(achieved_goal - self.subgoal, axis=1) <= self._config.reached_m
+        renew = np.flatnonzero(reached | (self.age >= self._config.every_steps))
+        if len(renew):
+            self.subgoal[renew] = self._choose(observation[renew], desired_goal[renew])
+            self.age[renew] = 0
+        self.age += 1
+        action = self._agent.sac.act(
+            self._tensor(observation), self._tensor(self.subgoal), explore=explore
+        )
+        return action.cpu().numpy()
+
+    def _choose(self, observation: np.ndarray, desired_goal: np.ndarray) -> np.ndarray:
+        if self._config.source == "none":
+            return desired_goal
+        state, goal = self._tensor(observation), self._tensor(desired_goal)
+        candidates, likelihood = self._propose(state, goal)
+        chosen = select(self._agent, state, goal, candidates, likelihood).cpu().numpy()
+        near = np.linalg.norm(chosen - desired_goal, axis=1) <= self._config.final_m
+        return np.where(near[:, None], desired_goal, chosen)
+
+    def _propose(self, state: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        count = self._config.candidates
+        if self._config.source == "random":
+            bank = self._agent.bank
+            drawn = bank[torch.randint(len(bank), (len(state), count), device=bank.device)]
+            return drawn, torch.zeros(drawn.shape[:2], device=bank.device)
+        return self._agent.proposer.propose(state, goal, count)
+
+    def _tensor(self, array: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array)).to(self._device)

@@ -1,0 +1,284 @@
+"""Online fine-tuning: rollouts with subgoals, and updates on old and new data (Algorithm 2).
+
+The run goes in rounds. In a round all worlds take the same number of steps, their trajectories
+enter the replay, and the networks are updated; physics and learning never compete for the cores.
+Worlds start anew only between rounds, so that a trajectory is never cut in the middle of one.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from eisp_data.errors import ConfigError
+from eisp_data.sim.worlds import Worlds
+from finetune.evaluate import Evaluation, evaluate
+from finetune.rollout import SubgoalPolicy
+from pretrain import checkpoint
+from pretrain.agent import Agent
+from pretrain.metrics import MetricsLog
+from pretrain.replay import GoalMix, Trajectories
+from pretrain.sac import Batch, SacOptimizer
+from pretrain.train import update_generator
+
+_SELECTION_SEED = 500_000_000
+"""Seeds from here on choose among checkpoints; none of them is ever reported on."""
+_TRAINING_SEED = 1_000_000_000
+"""Seeds from here on are the worlds that are learned in."""
+
+
+@dataclass(frozen=True)
+class OnlineConfig:
+    """Online fine-tuning."""
+
+    rounds: int = 40
+    worlds: int = 32
+    round_steps: int = 50
+    """Steps of every world in a round."""
+    updates: int = 300
+    """Updates of SAC in a round."""
+    batch_size: int = 256
+    offline_share: float = 0.5
+    """Share of each batch that comes from the dataset."""
+    cloning: float = 5.0
+    """Weight of cloning actions that led to the goal, where they are worth more than the actor's."""
+    generator_every: int = 4
+    """Updates of SAC for one of the generator; 0 leaves the generator as it is."""
+    generator_batch_size: int = 256
+    generator_lr: float = 3e-4
+    replay_size: int = 1_000_000
+    """Rows kept of the worlds' trajectories (Table I: D)."""
+    evaluate_every: int = 5
+    """Rounds between evaluations, each followed by a checkpoint."""
+    evaluation_episodes: int = 100
+
+
+@dataclass
+class Rollouts:
+    """Worlds that are being learned in, and how far each has come."""
+
+    worlds: Worlds
+    policy: SubgoalPolicy
+    next_seed: int
+
+    def start(self, due: np.ndarray) -> None:
+        """Start the named worlds anew."""
+        seeds = self.next_seed + np.arange(len(due))
+        self.worlds.reset(seeds, due)
+        self.policy.reset(due)
+        self.next_seed += len(due)
+
+    def collect(self, steps: int) -> tuple[np.ndarray, ...]:
+        """Step all worlds, exploring; then start anew those that are over or have succeeded.
+
+        Returns:
+            Observations, achieved goals and actions (N * (steps + 1), ...), world after world,
+            and the (N + 1,) starts of the worlds' trajectories.
+        """
+        worlds = self.worlds
+        rows: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        for _ in range(steps):
+            observation, achieved = worlds.observation, worlds.achieved_goal
+            action = self.policy.act(observation, achieved, worlds.desired_goal, explore=True)
+            rows.append((observation, achieved, action))
+            worlds.step(action)
+        rows.append((worlds.observation, worlds.achieved_goal, np.zeros_like(action)))
+        columns = [np.stack(column, 1) for column in zip(*rows, strict=True)]
+        self.start(np.flatnonzero(worlds.truncated | worlds.success))
+        starts = np.arange(worlds.count + 1) * (steps + 1)
+        return *(c.reshape(-1, c.shape[-1]) for c in columns), starts
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return what ``restore`` needs."""
+        worlds = {f"worlds/{name}": value for name, value in self.worlds.snapshot().items()}
+        return worlds | {
+            "subgoal": self.policy.subgoal,
+            "age": self.policy.age,
+            "next_seed": np.array(self.next_seed),
+        }
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Go on from what ``state`` returned."""
+        prefix = "worlds/"
+        self.worlds.restore_snapshot(
+            {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+        )
+        self.policy.subgoal, self.policy.age = arrays["subgoal"], arrays["age"]
+        self.next_seed = int(arrays["next_seed"])
+
+
+class Finetuner:
+    """One run of online fine-tuning.
+
+    Args:
+        run: its folder.
+        agent: what is fine-tuned.
+        offline: the dataset that it was pretrained on.
+        make_worlds: makes a batch of worlds of a given size.
+        mix: the goals that the low-level policy learns from.
+        config: the hyperparameters.
+        seed: of the run.
+        device: where the agent is.
+    """
+
+    def __init__(
+        self,
+        run: Path,
+        agent: Agent,
+        offline: Trajectories,
+        make_worlds: Callable[[int], Worlds],
+        mix: GoalMix,
+        config: OnlineConfig,
+        seed: int,
+        device: str,
+    ) -> None:
+        self.run, self.agent, self.config = run, agent, config
+        self._mix, self._device = mix, device
+        self._rng = np.random.default_rng(seed)
+        torch.manual_seed(seed)
+        self._offline = offline
+        self._online = Trajectories(agent.layout, config.replay_size, agent.config.waypoints)
+        self._sac = SacOptimizer(agent.sac)
+        self._generator = torch.optim.Adam(
+            agent.proposer.parameters(), lr=config.generator_lr, fused=True
+        )
+        worlds = make_worlds(config.worlds)
+        if worlds.episode_steps % config.round_steps:
+            raise ConfigError(
+                f"--online.round-steps {config.round_steps} must divide the "
+                f"{worlds.episode_steps} steps of an episode"
+            )
+        policy = SubgoalPolicy(agent, config.worlds, device)
+        self._rollouts = Rollouts(worlds, policy, _TRAINING_SEED + seed * 10_000_000)
+        self._evaluation_worlds = make_worlds(min(100, config.evaluation_episodes))
+        self._curve: list[dict[str, float]] = []
+        self._round = 0
+        self._spent = 0.0
+
+    def __call__(self, resume: bool) -> dict[str, float]:
+        """Train, or go on training, to the last round; return the summary of the run."""
+        if resume:
+            self._restore()
+        log = MetricsLog(self.run, "finetune", self._round * self.config.updates)
+        start = time.monotonic() - self._spent
+        if not resume:
+            self._rollouts.start(np.arange(self.config.worlds))
+            self._evaluate(log, {}, start)
+        rounds = range(self._round + 1, self.config.rounds + 1)
+        bar = tqdm(rounds, "fine-tuning", self.config.rounds, initial=self._round, mininterval=1.0)
+        for self._round in bar:
+            self._online.extend(*self._rollouts.collect(self.config.round_steps))
+            info = self._learn()
+            if self._round % self.config.evaluate_every == 0 or self._round == self.config.rounds:
+                result = self._evaluate(log, info, start)
+                bar.set_postfix(success=result.success_last.mean, return_=result.return_.mean)
+        log.close()
+        return summarise(self._curve)
+
+    def _learn(self) -> dict[str, Tensor]:
+        config, info = self.config, {}
+        offline = round(config.offline_share * config.batch_size) if len(self._offline) else 0
+        for update in range(1, config.updates + 1):
+            parts = [self._online.transitions(config.batch_size - offline, self._mix, self._rng)]
+            if offline:
+                parts.append(self._offline.transitions(offline, self._mix, self._rng))
+            batch = Batch.joined(parts).to(self._device)
+            info |= self._sac.update(batch, config.cloning, only_better=True)
+            if config.generator_every and update % config.generator_every == 0:
+                source = self._offline
+                if not offline or self._rng.random() >= config.offline_share:
+                    source = self._online
+                if len(source.leading):
+                    count = config.generator_batch_size
+                    info |= update_generator(self.agent, self._generator, source, count, self._rng)
+        return info
+
+    def _evaluate(self, log: MetricsLog, info: dict[str, Tensor], start: float) -> Evaluation:
+        count = self.config.evaluation_episodes
+        # Evaluating must not disturb the run's own random numbers: curves stay comparable.
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            result = evaluate(
+                self.agent, self._evaluation_worlds, count, _SELECTION_SEED, device=self._device
+            )
+        env_steps = self._round * self.config.worlds * self.config.round_steps
+        point = {
+            "success_last": result.success_last.mean,
+            "success_any": result.success_any.mean,
+            "return": result.return_.mean,
+        }
+        self._curve.append({"env_steps": env_steps, **point})
+        if point == max(
+            (p for p in self._points()), key=lambda p: (p["success_last"], p["return"])
+        ):
+            self.agent.save(self.run / "best" / checkpoint.POLICY)
+        self._spent = time.monotonic() - start
+        values = {f"train/{k}": v for k, v in info.items()}
+        values |= {f"eval/{k}": v for k, v in point.items()}
+        log.write(self._round * self.config.updates, env_steps, self._spent, values)
+        self._checkpoint()
+        return result
+
+    def _points(self) -> list[dict[str, float]]:
+        return [{k: v for k, v in p.items() if k != "env_steps"} for p in self._curve]
+
+    @property
+    def _optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        return {
+            "actor": self._sac.actor,
+            "critic": self._sac.critic,
+            "generator": self._generator,
+        }
+
+    def _checkpoint(self) -> None:
+        online = self._online
+        arrays = self._rollouts.state() | {
+            "online/observation": online.observation,
+            "online/achieved_goal": online.achieved_goal,
+            "online/action": online.action,
+            "online/episode_start": online.episode_start,
+        }
+        numbers = {"curve": self._curve, "wall_s": self._spent}
+        checkpoint.save(
+            self.run, self._round, self.agent, self._optimizers, self._rng, numbers, arrays
+        )
+
+    def _restore(self) -> None:
+        self._round, numbers, arrays = checkpoint.restore(
+            self.run, self.agent, self._optimizers, self._rng
+        )
+        self._curve, self._spent = numbers["curve"], numbers["wall_s"]
+        names = ("observation", "achieved_goal", "action", "episode_start")
+        self._online.extend(*(arrays[f"online/{name}"] for name in names))
+        self._rollouts.restore(arrays)
+
+
+def summarise(curve: list[dict[str, float]]) -> dict[str, float]:
+    """Return how deep success fell after going online, and the steps until it was back.
+
+    Args:
+        curve: evaluations in time, the first of them before any online step.
+    """
+    first = curve[0]["success_last"]
+    success = [point["success_last"] for point in curve]
+    lowest = int(np.argmin(success))
+    below = [i for i, value in enumerate(success) if value < first]
+    back = [i for i in range(lowest, len(curve)) if success[i] >= first]
+    recovered = float("nan")
+    if not below:
+        recovered = 0.0
+    elif back:
+        recovered = curve[back[0]]["env_steps"] - curve[below[0] - 1]["env_steps"]
+    return {
+        "offline_success": first,
+        "dip": max(0.0, first - success[lowest]),
+        "recovery_steps": recovered,
+        "best_success": max(success),
+    }

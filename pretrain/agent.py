@@ -1,0 +1,136 @@
+"""All that is learned and how it is put together: features, SAC, generator, a bank of goals."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from eisp_data.config import from_plain, to_plain
+from eisp_data.errors import ConfigError, DataError
+from pretrain.features import ObjectFeatures, PlainFeatures
+from pretrain.layout import Layout
+from pretrain.proposers.hybrid import Hybrid, HybridConfig
+from pretrain.proposers.movers import Movers, MoversConfig
+from pretrain.proposers.proposer import SubgoalProposer
+from pretrain.sac import Sac, SacConfig
+
+BANK = 4096
+"""Achieved goals of the dataset that an agent carries with it, for random subgoals."""
+
+
+@dataclass(frozen=True)
+class SubgoalConfig:
+    """When and how subgoals are chosen during a rollout (the paper's Algorithm 1)."""
+
+    source: Literal["generator", "random", "none"] = "generator"
+    """The generator, achieved goals drawn from the dataset, or the final goal alone."""
+    candidates: int = 16
+    """K"""
+    selector: Literal["value", "route"] = "route"
+    """``value`` is the paper's Eq. (11); for ``route`` see ``finetune.selector``."""
+    every_steps: int = 30
+    """T, the steps that a subgoal may take (Table I)."""
+    reached_m: float = 0.02
+    """A subgoal is reached within this distance (the paper's epsilon)."""
+    final_m: float = 0.05
+    """A subgoal this near to the final goal gives way to it (the paper's epsilon)."""
+
+
+@dataclass(frozen=True)
+class AgentConfig:
+    """An agent's parts."""
+
+    task: str
+    """Name of the task, or id of the environment."""
+    features: Literal["objects", "plain"] = "objects"
+    generator: Literal["movers", "hybrid"] = "movers"
+    waypoints: int | None = None
+    """The paper's n, which cuts trajectories evenly; None cuts them where objects rest."""
+    sac: SacConfig = field(default_factory=SacConfig)
+    movers: MoversConfig = field(default_factory=MoversConfig)
+    hybrid: HybridConfig = field(default_factory=HybridConfig)
+    subgoals: SubgoalConfig = field(default_factory=SubgoalConfig)
+
+
+class Agent(nn.Module):
+    """Low-level policy and subgoal generator.
+
+    Args:
+        config: which parts.
+        layout: the environment's.
+        moments: of the dataset, see ``pretrain.replay.Trajectories.moments``.
+        bank: (BANK, G) achieved goals.
+    """
+
+    bank: Tensor
+
+    def __init__(
+        self, config: AgentConfig, layout: Layout, moments: dict[str, Tensor], bank: Tensor
+    ) -> None:
+        super().__init__()
+        if not layout.objects and "objects" in (config.features, _NEEDS.get(config.generator)):
+            raise ConfigError(
+                f"{config.task}: its goal is not made of objects; "
+                "choose --agent.features plain --agent.generator hybrid"
+            )
+        self.config, self.layout = config, layout
+        features: nn.Module = (
+            ObjectFeatures(layout)
+            if config.features == "objects"
+            else PlainFeatures(layout, moments)
+        )
+        self.sac = Sac(features, layout.action_dim, config.sac)
+        self.proposer: SubgoalProposer = (
+            Movers(layout, config.movers)
+            if config.generator == "movers"
+            else Hybrid(layout, moments, config.hybrid)
+        )
+        self.register_buffer("bank", bank)
+
+    def save(self, folder: Path) -> None:
+        """Write ``config.json`` and ``model.safetensors``."""
+        folder.mkdir(parents=True, exist_ok=True)
+        # Modules share the feature buffers; a file must not.
+        tensors = {name: value.clone().contiguous() for name, value in self.state_dict().items()}
+        save_file(tensors, folder / "model.safetensors")
+        plain = {"agent": to_plain(self.config), "layout": to_plain(self.layout)}
+        (folder / "config.json").write_text(json.dumps(plain, indent=2))
+
+    @classmethod
+    def load(cls, folder: Path, device: str = "cpu") -> Agent:
+        """Read what ``save`` wrote; DataError if it cannot be read."""
+        try:
+            plain: dict[str, Any] = json.loads((folder / "config.json").read_text())
+            tensors = load_file(folder / "model.safetensors")
+        except FileNotFoundError as error:
+            raise DataError(
+                f"{folder} holds no policy: {Path(error.filename or '').name} is missing"
+            ) from None
+        except Exception as error:  # safetensors and json each have errors of their own
+            raise DataError(f"{folder} holds no readable policy: {error}") from None
+        layout = from_plain(Layout, plain["layout"])
+        agent = cls(
+            from_plain(AgentConfig, plain["agent"]),
+            layout,
+            empty_moments(layout),
+            torch.zeros_like(tensors["bank"]),
+        )
+        agent.load_state_dict(tensors)
+        return agent.to(device)
+
+
+_NEEDS = {"movers": "objects"}
+
+
+def empty_moments(layout: Layout) -> dict[str, Tensor]:
+    """Return moments that change nothing: means zero, deviations one."""
+    sizes = {"observation": layout.observation_dim, "goal": layout.goal_dim}
+    return {f"{name}_mean": torch.zeros(size) for name, size in sizes.items()} | {
+        f"{name}_std": torch.ones(size) for name, size in sizes.items()
+    }

@@ -1,0 +1,139 @@
+"""Checkpoints in LeRobot's layout, that survive a kill at any moment.
+
+``checkpoints/<step>/pretrained_model/{config.json, model.safetensors}`` is the policy,
+``checkpoints/<step>/training_state/`` what is needed to go on, ``checkpoints/last`` the newest.
+Nothing is pickled.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors.numpy import load_file as load_arrays
+from safetensors.numpy import save_file as save_arrays
+from torch import Tensor
+
+from eisp_data.errors import DataError
+from pretrain.agent import Agent
+
+POLICY = "pretrained_model"
+_STATE = "training_state"
+_KEPT = 2
+
+
+def save(
+    run: Path,
+    step: int,
+    agent: Agent,
+    optimizers: Mapping[str, torch.optim.Optimizer],
+    rng: np.random.Generator,
+    numbers: Mapping[str, Any],
+    arrays: Mapping[str, np.ndarray],
+) -> None:
+    """Write a checkpoint beside its place, move it there, and drop all but the newest two.
+
+    Args:
+        run: the run's folder.
+        step: what the checkpoint is called, and which of two is newer.
+        agent: the policy.
+        optimizers: by name; they must be made the same way again before ``restore``.
+        rng: the run's generator.
+        numbers: JSON values.
+        arrays: whatever else must be restored.
+    """
+    folder = run / "checkpoints" / f"{step:06d}"
+    draft = folder.with_name(f".{folder.name}.draft")
+    shutil.rmtree(draft, ignore_errors=True)
+    agent.save(draft / POLICY)
+    state = draft / _STATE
+    state.mkdir()
+    tensors = {"torch_rng": torch.get_rng_state()} | _flatten(optimizers)
+    # Contiguous and unshared, as the format wants them.
+    plain = {name: np.array(value.cpu().numpy(), order="C") for name, value in tensors.items()}
+    save_arrays(
+        plain | {f"array/{k}": np.array(v, order="C") for k, v in arrays.items()},
+        state / "state.safetensors",
+    )
+    (state / "state.json").write_text(
+        json.dumps({"step": step, "rng": rng.bit_generator.state, "numbers": dict(numbers)})
+    )
+    for path in (*state.iterdir(), *(draft / POLICY).iterdir()):
+        with path.open("rb") as file:
+            os.fsync(file.fileno())
+    shutil.rmtree(folder, ignore_errors=True)
+    draft.rename(folder)
+    link = folder.with_name(".last")
+    link.unlink(missing_ok=True)
+    link.symlink_to(folder.name)
+    link.rename(folder.with_name("last"))
+    for old in sorted(p for p in folder.parent.iterdir() if p.name.isdigit())[:-_KEPT]:
+        shutil.rmtree(old)
+
+
+def restore(
+    run: Path,
+    agent: Agent,
+    optimizers: Mapping[str, torch.optim.Optimizer],
+    rng: np.random.Generator,
+) -> tuple[int, dict[str, Any], dict[str, np.ndarray]]:
+    """Put agent, optimizers and generators back where the newest checkpoint left them.
+
+    Returns:
+        Its step, its numbers and its arrays.
+    """
+    folder = run / "checkpoints" / "last"
+    agent.load_state_dict(Agent.load(folder / POLICY).state_dict())
+    try:
+        plain = json.loads((folder / _STATE / "state.json").read_text())
+        tensors = load_arrays(folder / _STATE / "state.safetensors")
+    except Exception as error:  # each format has errors of its own
+        raise DataError(f"{folder} cannot be resumed from: {error}") from None
+    _unflatten(optimizers, tensors)
+    torch.set_rng_state(torch.from_numpy(tensors["torch_rng"]))
+    rng.bit_generator.state = plain["rng"]
+    arrays = {k.removeprefix("array/"): v for k, v in tensors.items() if k.startswith("array/")}
+    return plain["step"], plain["numbers"], arrays
+
+
+def exists(run: Path) -> bool:
+    """Return whether the run has a checkpoint."""
+    return (run / "checkpoints" / "last" / _STATE / "state.json").exists()
+
+
+def find_policy(path: Path) -> Path:
+    """Return the folder of the policy for a path that names it, its checkpoint or its run."""
+    for candidate in (path, path / POLICY, path / "checkpoints" / "last" / POLICY):
+        if (candidate / "model.safetensors").exists():
+            return candidate
+    raise DataError(
+        f"{path} holds no policy; give a run, a checkpoint, or a folder with model.safetensors"
+    )
+
+
+def _flatten(optimizers: Mapping[str, torch.optim.Optimizer]) -> dict[str, Tensor]:
+    return {
+        f"{name}/{index}/{key}": torch.as_tensor(value)
+        for name, optimizer in optimizers.items()
+        for index, state in optimizer.state_dict()["state"].items()
+        for key, value in state.items()
+    }
+
+
+def _unflatten(
+    optimizers: Mapping[str, torch.optim.Optimizer], tensors: Mapping[str, np.ndarray]
+) -> None:
+    for name, optimizer in optimizers.items():
+        state: dict[int, dict[str, Tensor]] = {}
+        for path, value in tensors.items():
+            if path.startswith(f"{name}/"):
+                _, index, key = path.split("/")
+                state.setdefault(int(index), {})[key] = torch.from_numpy(value)
+        groups = optimizer.state_dict()["param_groups"]
+        optimizer.load_state_dict({"state": state, "param_groups": groups})

@@ -1,0 +1,54 @@
+"""Metrics of a run: one JSON object a line, and TensorBoard."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+
+class MetricsLog:
+    """Appends to ``metrics.jsonl`` and to TensorBoard's event files beside it.
+
+    Args:
+        run: the run's folder.
+        stage: ``pretrain`` or ``finetune``; other stages' lines in the file stay as they are.
+        done: drop what this stage has logged after this many updates: a resumed run does it again.
+    """
+
+    def __init__(self, run: Path, stage: str, done: int) -> None:
+        from torch.utils.tensorboard import SummaryWriter
+
+        self._stage = stage
+        path = run / "metrics.jsonl"
+        lines = path.read_text().splitlines() if path.exists() else []
+        path.write_text("".join(f"{line}\n" for line in lines if self._keeps(line, done)))
+        self._file = path.open("a")
+        self._board = SummaryWriter(str(run), purge_step=done or None)
+
+    def _keeps(self, line: str, done: int) -> bool:
+        try:
+            entry = json.loads(line)
+        except ValueError:  # a line cut off by a kill
+            return False
+        return entry["stage"] != self._stage or entry["updates"] <= done
+
+    def write(self, updates: int, env_steps: int, wall_s: float, values: Mapping[str, Any]) -> None:
+        """Log the values at this many updates and environment steps of the stage."""
+        numbers = {name: float(value) for name, value in values.items()}
+        head = {
+            "stage": self._stage,
+            "updates": updates,
+            "env_steps": env_steps,
+            "wall_s": round(wall_s, 3),
+        }
+        self._file.write(json.dumps(head | numbers) + "\n")
+        self._file.flush()
+        for name, value in numbers.items():
+            self._board.add_scalar(f"{self._stage}/{name}", value, updates)
+
+    def close(self) -> None:
+        """Write out what is pending."""
+        self._file.close()
+        self._board.close()

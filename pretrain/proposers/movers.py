@@ -1,0 +1,151 @@
+"""The hybrid generator, asked anew: which object moves next, and where to.
+
+The paper's encoder is one Laplace over all objects at once. Between two stable arrangements one
+object moves (others perhaps with it), and which one is a choice among few: one Laplace must
+average over the choices, a mixture need not. So the explicit encoder is here
+
+    p(subgoal | s, g) = sum_i w_i(s, g) prod_j Laplace(subgoal_j; mean_ij, scale_ij),
+
+component i being "object i moves", with mean_ij = place_j + gate_ij (goal_j - place_j) + shift_ij:
+an object stays, goes to its goal, or is put somewhere else. It is built from pairs of objects, so
+that interchangeable objects share all parameters. The implicit decoder, the likelihood and the
+divergence are the paper's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from pretrain.features import object_tokens, scaled_robot
+from pretrain.layout import Layout
+from pretrain.networks import mlp
+from pretrain.proposers import laplace
+from pretrain.proposers.proposer import Info, SubgoalProposer
+
+_SCALE = 10.0
+"""Lengths are in decimetres inside the networks."""
+_LEAST_SCALE, _MOST_SCALE = 0.02, 2.0
+
+
+@dataclass(frozen=True)
+class MoversConfig:
+    """The mixture generator."""
+
+    width: int = 128
+    """Size of all hidden layers."""
+    likelihood: float = 1.0
+    """Weight of L_HS, the negative log-likelihood of the hindsight subgoals."""
+    reconstruction: float = 0.01
+    """Weight of the decoder's -log p(g | subgoal, s)."""
+    divergence: float = 1e-3
+    """Weight of KL(encoder || prior)."""
+    temperature: float = 0.3
+    """Candidates are drawn with the Laplace scales multiplied by this."""
+
+
+class Movers(SubgoalProposer):
+    """Mixture over movers; see the module."""
+
+    def __init__(self, layout: Layout, config: MoversConfig) -> None:
+        super().__init__()
+        self._layout, self.config = layout, config
+        count = len(layout.objects)
+        kinds = torch.tensor([item.kind for item in layout.objects])
+        self.register_buffer("_kind", nn.functional.one_hot(kinds, layout.kinds).float())
+        self._columns = torch.tensor([item.goal for item in layout.objects])[:, None]
+        self._columns = self._columns + torch.arange(3)
+        token = 20 + layout.kinds
+        width = config.width
+        self.pairs = mlp(layout.robot_dim + 2 * token + 1, (width,), width)
+        self.context = mlp(layout.robot_dim + token + 2 * width, (width,), width)
+        self.weight = nn.Linear(width, 1)
+        self.moves = mlp(2 * width, (width,), 7)
+        self.decoder = mlp(layout.observation_dim + layout.goal_dim, (width,) * 2, layout.goal_dim)
+        self.register_buffer("_same", torch.eye(count))
+
+    def components(self, observation: Tensor, goal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return log-weights (B, M), means (B, M, n, 3) and scales likewise, in decimetres.
+
+        The means are relative to where the objects are.
+        """
+        batch, count = len(observation), len(self._layout.objects)
+        robot = scaled_robot(observation[:, : self._layout.robot_dim])
+        tokens = object_tokens(self._layout, observation, goal)
+        kind = self._kind.expand(batch, -1, -1)
+        tokens = torch.cat([tokens, kind], -1)
+        mover = tokens[:, :, None].expand(-1, -1, count, -1)
+        other = tokens[:, None].expand(-1, count, -1, -1)
+        same = self._same.expand(batch, -1, -1)[..., None]
+        around = robot[:, None, None].expand(-1, count, count, -1)
+        pair = torch.relu(self.pairs(torch.cat([around, mover, other, same], -1)))
+        pooled = torch.cat([pair.mean(2), pair.amax(2)], -1)
+        context = torch.cat([robot[:, None].expand(-1, count, -1), tokens, pooled], -1)
+        context = torch.relu(self.context(context))
+        logits = self.weight(context).squeeze(-1)
+        joined = torch.cat([pair, context[:, :, None].expand(-1, -1, count, -1)], -1)
+        gate, shift, spread = self.moves(joined).split([1, 3, 3], -1)
+        way = other[..., 6:9]
+        mean = torch.sigmoid(gate) * way + shift
+        scale = nn.functional.softplus(spread).clamp(max=_MOST_SCALE) + _LEAST_SCALE
+        return logits.log_softmax(-1), mean, scale
+
+    def _relative(self, observation: Tensor, goal: Tensor) -> Tensor:
+        """Return (B, n, 3): goals relative to where the objects are, decimetres."""
+        return (goal[:, self._columns] - self._place(observation)) * _SCALE
+
+    def _place(self, observation: Tensor) -> Tensor:
+        starts = torch.tensor([item.observation for item in self._layout.objects])
+        return observation[:, starts[:, None] + torch.arange(3)]
+
+    def propose(self, observation: Tensor, goal: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        """Draw candidates; the first M are the means of the components, likeliest first."""
+        with torch.no_grad():
+            log_weight, mean, scale = self.components(observation, goal)
+            batch, movers = log_weight.shape
+            order = log_weight.argsort(1, descending=True)[:, :count]
+            drawn = torch.multinomial(
+                log_weight.exp(), max(count - movers, 0) or 1, replacement=True
+            )[:, : max(count - movers, 0)]
+            which = torch.cat([order, drawn], 1)
+            rows = torch.arange(batch)[:, None]
+            chosen = mean[rows, which]
+            spread = scale[rows, which] * self.config.temperature
+            candidate = laplace.sample(chosen, spread)
+            candidate[:, :movers] = chosen[:, :movers]
+            log_prob = log_weight.gather(1, which)
+            places = self._place(observation)[:, None] + candidate / _SCALE
+            result = goal[:, None].repeat(1, which.shape[1], 1)
+            result[..., self._columns] = places
+            return result, log_prob
+
+    def loss(self, observation: Tensor, goal: Tensor, subgoal: Tensor) -> tuple[Tensor, Info]:
+        """Return beta L_HS + reconstruction + divergence, weighted as configured."""
+        log_weight, mean, scale = self.components(observation, goal)
+        target = self._relative(observation, subgoal)[:, None]
+        each = laplace.log_prob(target.flatten(2), mean.flatten(2), scale.flatten(2))
+        likelihood = (log_weight + each).logsumexp(1)
+        sampled = laplace.sample(mean, scale)
+        places = self._place(observation)[:, None] * _SCALE + sampled
+        state = observation[:, None].expand(-1, places.shape[1], -1)
+        guess = self.decoder(torch.cat([state, places.flatten(2)], -1))
+        true_goal = goal[:, self._columns].flatten(1)[:, None] * _SCALE
+        # A unit-scale Laplace in decimetres, constants dropped.
+        missed = (guess - true_goal).abs().sum(-1)
+        weight = log_weight.exp()
+        reconstruction = (weight * missed).sum(1)
+        divergence = laplace.kl_to_standard_normal(mean.flatten(2), scale.flatten(2))
+        divergence = (weight * divergence).sum(1)
+        config = self.config
+        loss = (
+            -config.likelihood * likelihood
+            + config.reconstruction * reconstruction
+            + config.divergence * divergence
+        ).mean()
+        return loss, {
+            "log_likelihood": likelihood.detach().mean(),
+            "reconstruction_error": reconstruction.detach().mean(),
+            "divergence": divergence.detach().mean(),
+        }

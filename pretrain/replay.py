@@ -1,0 +1,150 @@
+"""Trajectories in memory, and batches of them with goals relabelled in hindsight."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pretrain.hindsight import Waypoints, find_waypoints
+from pretrain.layout import Layout
+from pretrain.sac import Batch
+
+
+@dataclass(frozen=True)
+class GoalMix:
+    """Which goals the low-level policy learns from."""
+
+    waypoint: float = 0.5
+    """Share of goals that are the next waypoint: what a subgoal generator will ask for."""
+    future: float = 0.3
+    """Share of goals achieved a little later in the same trajectory."""
+    displaced: float = 0.2
+    """Share of goals that send one object to where it, or its like, lay at another time."""
+    horizon: int = 40
+    """How many steps later a ``future`` goal may lie."""
+    tolerance_m: float = 0.05
+    """epsilon of Eq. (1) for these goals: tighter than the task's, because errors add up."""
+
+
+class Trajectories:
+    """Rows of observations, achieved goals and actions, episode after episode.
+
+    An episode of T actions has T + 1 rows; the action of its last row means nothing.
+
+    Args:
+        layout: the environment's.
+        capacity: most rows kept; the oldest episodes make room.
+        parts: the paper's n for its waypoints; None for waypoints at rest.
+    """
+
+    def __init__(self, layout: Layout, capacity: int, parts: int | None = None) -> None:
+        self._layout, self._capacity, self._parts = layout, capacity, parts
+        self.observation = np.empty((0, layout.observation_dim), np.float32)
+        self.achieved_goal = np.empty((0, layout.goal_dim), np.float32)
+        self.action = np.empty((0, layout.action_dim), np.float32)
+        self.episode_start = np.zeros(1, np.int64)
+        self.waypoints = Waypoints(*(np.empty(0, np.int64) for _ in range(3)))
+        self._index()
+
+    def __len__(self) -> int:
+        return len(self.observation)
+
+    def extend(
+        self,
+        observation: np.ndarray,
+        achieved_goal: np.ndarray,
+        action: np.ndarray,
+        episode_start: np.ndarray,
+    ) -> None:
+        """Append whole episodes: rows (R, ...) and their (E + 1,) starts."""
+        starts = np.concatenate([self.episode_start, len(self) + np.asarray(episode_start[1:])])
+        first = int(np.searchsorted(starts, starts[-1] - self._capacity))
+        cut = int(starts[first])
+        self.observation = np.concatenate([self.observation, observation])[cut:]
+        self.achieved_goal = np.concatenate([self.achieved_goal, achieved_goal])[cut:]
+        self.action = np.concatenate([self.action, action])[cut:]
+        self.episode_start = starts[first:] - cut
+        added = find_waypoints(achieved_goal, np.asarray(episode_start), self._parts)
+        self.waypoints = self.waypoints.joined(added).without_first(cut)
+        self._index()
+
+    def _index(self) -> None:
+        lengths = np.diff(self.episode_start)
+        self._last = np.repeat(self.episode_start[1:] - 1, lengths)
+        self.acting = np.flatnonzero(np.arange(len(self)) < self._last)
+        """Rows that have an action."""
+        self.leading = self.acting[self.waypoints.following[self.acting] >= 0]
+        """Rows that have a waypoint after them."""
+
+    def transitions(self, count: int, mix: GoalMix, rng: np.random.Generator) -> Batch:
+        """Draw transitions with goals relabelled as the mix says."""
+        kind = rng.choice(3, size=count, p=[mix.waypoint, mix.future, mix.displaced])
+        rows = self.acting[rng.integers(len(self.acting), size=count)]
+        if len(self.leading):
+            lead = kind == 0
+            rows[lead] = self.leading[rng.integers(len(self.leading), size=int(lead.sum()))]
+        else:
+            kind[kind == 0] = 1
+        future = np.minimum(rows + rng.integers(1, mix.horizon + 1, size=count), self._last[rows])
+        source = np.where(kind == 0, 0, future)
+        source[kind == 0] = self.waypoints.row[self.waypoints.following[rows[kind == 0]]]
+        goal = self.achieved_goal[source]
+        self._displace(goal, rows, kind == 2, rng)
+        start, after = self.achieved_goal[rows], self.achieved_goal[rows + 1]
+        reached = np.linalg.norm(after - goal, axis=1) <= mix.tolerance_m
+        clone = (kind < 2) & (np.linalg.norm(goal - start, axis=1) > 0.01)
+        return Batch(
+            observation=torch.from_numpy(self.observation[rows]),
+            action=torch.from_numpy(self.action[rows]),
+            next_observation=torch.from_numpy(self.observation[rows + 1]),
+            goal=torch.from_numpy(goal),
+            reward=torch.from_numpy(reached.astype(np.float32) - 1.0),
+            clone=torch.from_numpy(clone.astype(np.float32)),
+        )
+
+    def _displace(
+        self, goal: np.ndarray, rows: np.ndarray, chosen: np.ndarray, rng: np.random.Generator
+    ) -> None:
+        """Let the chosen goals be where all is now, but for one object."""
+        picked = np.flatnonzero(chosen)
+        if not len(picked):
+            return
+        goal[picked] = self.achieved_goal[rows[picked]]
+        objects = self._layout.objects
+        if not objects:
+            goal[picked] = self.achieved_goal[rng.integers(len(self), size=len(picked))]
+            return
+        which = rng.integers(len(objects), size=len(picked))
+        columns = np.array([item.goal for item in objects])[which][:, None] + np.arange(3)
+        elsewhere = self.achieved_goal[rng.integers(len(self), size=len(picked))]
+        goal[picked[:, None], columns] = np.take_along_axis(elsewhere, columns, axis=1)
+
+    def moments(self) -> dict[str, Tensor]:
+        """Return means and standard deviations of observations and goals.
+
+        A dimension that never varies gets deviation one, so that it standardises to zero.
+        """
+        result = {}
+        for name, array in (("observation", self.observation), ("goal", self.achieved_goal)):
+            mean, std = array.mean(0, dtype=np.float64), array.std(0, dtype=np.float64)
+            std[std < 1e-6] = 1.0
+            result[f"{name}_mean"] = torch.from_numpy(mean.astype(np.float32))
+            result[f"{name}_std"] = torch.from_numpy(std.astype(np.float32))
+        return result
+
+    def subgoals(self, count: int, rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor]:
+        """Draw what a generator learns from.
+
+        Returns:
+            Observations (count, S), final goals (count, G) and the next waypoints (count, G).
+        """
+        rows = self.leading[rng.integers(len(self.leading), size=count)]
+        subgoal, goal = self.waypoints.subgoal_and_goal(rows, rng)
+        return (
+            torch.from_numpy(self.observation[rows]),
+            torch.from_numpy(self.achieved_goal[goal]),
+            torch.from_numpy(self.achieved_goal[subgoal]),
+        )

@@ -1,0 +1,214 @@
+"""Soft Actor-Critic on goals (Haarnoja et al. 2018), offline and online.
+
+Fixed temperature, as in the paper. Where it matters offline, two terms are added: values are
+clipped to the range that the reward of Eq. (1) allows, and the actor is drawn to the
+demonstrations' actions where the goal is one that the demonstration went on to reach.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor, nn
+
+from pretrain.networks import EnsembleMLP, mlp
+
+Info = dict[str, Tensor]
+
+_LOG_STD_MIN, _LOG_STD_MAX = -5.0, 1.0
+
+
+@dataclass(frozen=True)
+class SacConfig:
+    """Soft Actor-Critic."""
+
+    layers: tuple[int, ...] = (256, 256)
+    """Hidden sizes of actor and critics (Table I: pi)."""
+    lr: float = 3e-4
+    alpha: float = 0.01
+    """Temperature, fixed (Table I: alpha)."""
+    gamma: float = 0.99
+    """Discount (Table I: gamma)."""
+    tau: float = 0.005
+    """Share of the critic that enters its target at each update."""
+    layer_norm: bool = True
+    """Normalise the critics' hidden layers; off in the paper's preset."""
+    clip_targets: bool = True
+    """Clip the critics' targets to [-1 / (1 - gamma), 0], all that Eq. (1) allows."""
+    cloning: float = 20.0
+    """Weight of cloning the actions that led to the goal, offline; 0 is plain SAC."""
+
+
+@dataclass
+class Batch:
+    """B transitions with their goals."""
+
+    observation: Tensor
+    """(B, S)"""
+    action: Tensor
+    """(B, A)"""
+    next_observation: Tensor
+    """(B, S)"""
+    goal: Tensor
+    """(B, G)"""
+    reward: Tensor
+    """(B,) Eq. (1) for that goal, 0 or -1."""
+    clone: Tensor
+    """(B,) 1 where the trajectory went on to bring its objects to this goal, else 0."""
+
+    @classmethod
+    def joined(cls, parts: Sequence[Batch]) -> Batch:
+        """Return one batch of all the parts."""
+        return cls(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(cls)))
+
+    def to(self, device: str) -> Batch:
+        """Return the batch on a device."""
+        return Batch(*(getattr(self, f.name).to(device) for f in fields(self)))
+
+
+class Actor(nn.Module):
+    """A Gaussian squashed by tanh."""
+
+    def __init__(self, features: nn.Module, size: int, layers: Sequence[int], actions: int) -> None:
+        super().__init__()
+        self.features = features
+        self.body = mlp(size, layers, 2 * actions)
+
+    def forward(self, observation: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and log standard deviation, each (B, A), before the tanh."""
+        mean, log_std = self.body(self.features(observation, goal)).chunk(2, -1)
+        return mean, log_std.clamp(_LOG_STD_MIN, _LOG_STD_MAX)
+
+    def sample(self, observation: Tensor, goal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return a sampled action (B, A), its log-probability (B,) and the mean action (B, A)."""
+        mean, log_std = self(observation, goal)
+        noise = torch.randn_like(mean)
+        before = mean + noise * log_std.exp()
+        # log N(before) - log |d tanh / d before|, the latter in its stable form.
+        log_prob = -0.5 * noise.square() - log_std - 0.9189385332046727
+        log_prob -= 2 * (0.6931471805599453 - before - nn.functional.softplus(-2 * before))
+        return before.tanh(), log_prob.sum(-1), mean.tanh()
+
+
+class Critic(nn.Module):
+    """Twin action values."""
+
+    def __init__(
+        self, features: nn.Module, size: int, layers: Sequence[int], actions: int, layer_norm: bool
+    ) -> None:
+        super().__init__()
+        self.features = features
+        self.body = EnsembleMLP(2, size + actions, layers, layer_norm=layer_norm)
+
+    def forward(self, observation: Tensor, goal: Tensor, action: Tensor) -> Tensor:
+        """Return (2, B) values."""
+        return self.body(torch.cat([self.features(observation, goal), action], -1))
+
+
+class Sac(nn.Module):
+    """Actor, twin critics and their target.
+
+    Args:
+        features: a module with ``size`` and ``forward(observation, goal)``, without parameters.
+        actions: A.
+        config: the hyperparameters.
+    """
+
+    def __init__(self, features: nn.Module, actions: int, config: SacConfig) -> None:
+        super().__init__()
+        size = features.size
+        assert isinstance(size, int)
+        self.config = config
+        self.actor = Actor(features, size, config.layers, actions)
+        self.critic = Critic(features, size, config.layers, actions, config.layer_norm)
+        self.target = Critic(features, size, config.layers, actions, config.layer_norm)
+        self.target.load_state_dict(self.critic.state_dict())
+        self.target.requires_grad_(False)
+
+    @property
+    def lowest_value(self) -> float:
+        """The value of never reaching the goal."""
+        return -1.0 / (1.0 - self.config.gamma)
+
+    @torch.no_grad()
+    def act(self, observation: Tensor, goal: Tensor, *, explore: bool) -> Tensor:
+        """Return (B, A) actions: a sample if exploring, else the mean."""
+        action, _, mean = self.actor.sample(observation, goal)
+        return action if explore else mean
+
+    @torch.no_grad()
+    def value(self, observation: Tensor, goal: Tensor) -> Tensor:
+        """Return V(s, g) = E_a [min Q(s, g, a) - alpha log pi(a | s, g)], one sample, (B,)."""
+        action, log_prob, _ = self.actor.sample(observation, goal)
+        return self.critic(observation, goal, action).amin(0) - self.config.alpha * log_prob
+
+    def critic_loss(self, batch: Batch) -> tuple[Tensor, Info]:
+        """Return the mean squared Bellman error of both critics."""
+        with torch.no_grad():
+            action, log_prob, _ = self.actor.sample(batch.next_observation, batch.goal)
+            following = self.target(batch.next_observation, batch.goal, action).amin(0)
+            following = following - self.config.alpha * log_prob
+            target = batch.reward + self.config.gamma * following
+            if self.config.clip_targets:
+                target = target.clamp(self.lowest_value, 0.0)
+        value = self.critic(batch.observation, batch.goal, batch.action)
+        loss = (value - target).square().mean()
+        return loss, {"critic_loss": loss.detach(), "value": value.detach().mean()}
+
+    def actor_loss(self, batch: Batch, cloning: float, only_better: bool) -> tuple[Tensor, Info]:
+        """Return E [alpha log pi - min Q] plus the cloning term.
+
+        Args:
+            batch: transitions.
+            cloning: weight of the cloning term.
+            only_better: clone an action only where it is worth more than the actor's (Nair et al.
+                2018, "Q-filter").
+        """
+        action, log_prob, mean = self.actor.sample(batch.observation, batch.goal)
+        value = self.critic(batch.observation, batch.goal, action).amin(0)
+        loss = (self.config.alpha * log_prob - value).mean()
+        info = {"actor_loss": loss.detach(), "entropy": -log_prob.detach().mean()}
+        if cloning:
+            error = (mean - batch.action).square().sum(-1)
+            chosen = batch.clone
+            if only_better:
+                with torch.no_grad():
+                    shown = self.critic(batch.observation, batch.goal, batch.action).amin(0)
+                chosen = chosen * (shown > value.detach())
+            clone = (chosen * error).sum() / chosen.sum().clamp(min=1.0)
+            loss = loss + cloning * clone
+            info["cloning_error"] = clone.detach()
+        return loss, info
+
+    def follow(self) -> None:
+        """Let the target critic follow by ``tau``."""
+        with torch.no_grad():
+            targets = list(self.target.body.parameters())
+            sources = list(self.critic.body.parameters())
+            torch._foreach_lerp_(targets, sources, self.config.tau)
+
+
+class SacOptimizer:
+    """One update after another."""
+
+    def __init__(self, sac: Sac) -> None:
+        self.sac = sac
+        self.actor = torch.optim.Adam(sac.actor.parameters(), lr=sac.config.lr, fused=True)
+        self.critic = torch.optim.Adam(sac.critic.parameters(), lr=sac.config.lr, fused=True)
+
+    def update(self, batch: Batch, cloning: float, only_better: bool = False) -> Info:
+        """Update critics, actor and target on one batch; for the rest see ``Sac.actor_loss``."""
+        loss, critic_info = self.sac.critic_loss(batch)
+        self.critic.zero_grad(set_to_none=True)
+        loss.backward()
+        self.critic.step()
+        self.sac.critic.requires_grad_(False)
+        loss, actor_info = self.sac.actor_loss(batch, cloning, only_better)
+        self.actor.zero_grad(set_to_none=True)
+        loss.backward()
+        self.actor.step()
+        self.sac.critic.requires_grad_(True)
+        self.sac.follow()
+        return critic_info | actor_info

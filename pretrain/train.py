@@ -1,0 +1,214 @@
+"""Offline pretraining: SAC on hindsight goals and the generator on hindsight subgoals."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from eisp_data.config import save_yaml
+from eisp_data.errors import ConfigError, DataError
+from eisp_data.storage.cache import DatasetArrays, load_arrays
+from eisp_data.tasks.registry import TASKS
+from pretrain import checkpoint
+from pretrain.agent import BANK, Agent, AgentConfig
+from pretrain.device import DeviceName, describe, set_up
+from pretrain.layout import Layout
+from pretrain.metrics import MetricsLog
+from pretrain.replay import GoalMix, Trajectories
+from pretrain.sac import SacOptimizer
+
+_VALIDATION_SAMPLES = 4096
+_NEAR_M = 0.05
+
+
+@dataclass(frozen=True)
+class DatasetConfig:
+    """A dataset on the disk."""
+
+    root: Path
+    """Its folder."""
+
+
+@dataclass(frozen=True)
+class PretrainConfig:
+    """Offline pretraining."""
+
+    dataset: DatasetConfig
+    output_dir: Path
+    """Where the run goes."""
+    agent: AgentConfig
+    mix: GoalMix = field(default_factory=GoalMix)
+    updates: int = 15_000
+    """Updates of SAC."""
+    batch_size: int = 256
+    generator_every: int = 3
+    """Updates of SAC for one of the generator."""
+    generator_batch_size: int = 512
+    generator_lr: float = 1e-3
+    validation_share: float = 0.1
+    """Share of the episodes that are held out."""
+    validate_every: int = 1_000
+    """Updates between validations, each followed by a checkpoint."""
+    seed: int = 0
+    device: DeviceName = "auto"
+    threads: int | None = None
+    """Threads of the networks on a processor; all cores if left out."""
+    resume: bool = False
+    """Go on from the newest checkpoint in the output folder."""
+
+
+def pretrain(config: PretrainConfig) -> Path:
+    """Pretrain an agent; return the folder of the run."""
+    run = config.output_dir
+    resumed = prepare_run(run, config, config.resume, "pretrain.yaml")
+    device = set_up(config.device, config.threads)
+    print(describe(device), flush=True)
+    train, held_out, layout = load_trajectories(config)
+    torch.manual_seed(config.seed)
+    rng = np.random.default_rng(config.seed)
+    bank = train.achieved_goal[rng.integers(len(train), size=BANK)]
+    agent = Agent(config.agent, layout, train.moments(), torch.from_numpy(bank)).to(device)
+    sac = SacOptimizer(agent.sac)
+    generator = torch.optim.Adam(agent.proposer.parameters(), lr=config.generator_lr, fused=True)
+    optimizers = {"actor": sac.actor, "critic": sac.critic, "generator": generator}
+    done, best, best_state, spent = 0, -np.inf, {}, 0.0
+    if resumed:
+        done, numbers, arrays = checkpoint.restore(run, agent, optimizers, rng)
+        best, spent = numbers["best"], numbers["wall_s"]
+        best_state = {name: torch.from_numpy(value) for name, value in arrays.items()}
+    log = MetricsLog(run, "pretrain", done)
+    start = time.monotonic() - spent
+    info: dict[str, Tensor] = {}
+    steps = range(done + 1, config.updates + 1)
+    for update in tqdm(steps, "pretraining", config.updates, initial=done, mininterval=1.0):
+        batch = train.transitions(config.batch_size, config.mix, rng)
+        info |= sac.update(batch.to(device), config.agent.sac.cloning)
+        if update % config.generator_every == 0:
+            info |= update_generator(agent, generator, train, config.generator_batch_size, rng)
+        if update % config.validate_every == 0 or update == config.updates:
+            held = validate(agent, held_out, device)
+            if float(held["log_likelihood"]) > best:
+                best = float(held["log_likelihood"])
+                state = agent.proposer.state_dict()
+                best_state = {name: value.clone() for name, value in state.items()}
+            if update == config.updates:
+                agent.proposer.load_state_dict(best_state)
+            spent = time.monotonic() - start
+            values = {f"train/{k}": v for k, v in info.items()}
+            values |= {f"held_out/{k}": v for k, v in held.items()}
+            log.write(update, 0, spent, values)
+            checkpoint.save(
+                run,
+                update,
+                agent,
+                optimizers,
+                rng,
+                {"best": best, "wall_s": spent},
+                {name: value.cpu().numpy() for name, value in best_state.items()},
+            )
+    log.close()
+    return run
+
+
+def update_generator(
+    agent: Agent,
+    optimizer: torch.optim.Optimizer,
+    data: Trajectories,
+    count: int,
+    rng: np.random.Generator,
+) -> dict[str, Tensor]:
+    """Update the generator on hindsight subgoals."""
+    device = agent.bank.device
+    sample = (tensor.to(device) for tensor in data.subgoals(count, rng))
+    loss, info = agent.proposer.loss(*sample)
+    optimizer.zero_grad(set_to_none=True)
+    loss.backward()
+    torch.nn.utils.clip_grad_norm_(agent.proposer.parameters(), 100.0)
+    optimizer.step()
+    return info
+
+
+@torch.no_grad()
+def validate(agent: Agent, held_out: Trajectories, device: str) -> dict[str, Tensor]:
+    """Return the generator's losses on held-out episodes, and how its likeliest subgoals fare.
+
+    ``hits`` is the share within 5 cm of what was reached next; ``near_data`` the share of which
+    no object is further than 5 cm from where it was in some arrangement of the bank.
+    """
+    rng = np.random.default_rng(0)
+    sample = held_out.subgoals(_VALIDATION_SAMPLES, rng)
+    observation, goal, subgoal = (tensor.to(device) for tensor in sample)
+    _, info = agent.proposer.loss(observation, goal, subgoal)
+    proposed = agent.proposer.propose(observation, goal, 1)[0][:, 0]
+    hits = (proposed - subgoal).norm(dim=-1) <= _NEAR_M
+    part = proposed[:256].view(-1, 1, proposed.shape[1] // 3, 3)
+    known = agent.bank.view(1, len(agent.bank), -1, 3)
+    apart = (part - known).norm(dim=-1).amax(-1).amin(-1)
+    near = apart <= _NEAR_M
+    return info | {"hits": hits.float().mean(), "near_data": near.float().mean()}
+
+
+def load_trajectories(config: PretrainConfig) -> tuple[Trajectories, Trajectories, Layout]:
+    """Read the dataset into memory, split by episode into what is learned from and held out."""
+    arrays = load_arrays(config.dataset.root)
+    if arrays.spec.task != config.agent.task:
+        raise DataError(
+            f"{config.dataset.root} is a dataset of {arrays.spec.task!r}, "
+            f"not of {config.agent.task!r}"
+        )
+    layout = layout_of(arrays)
+    order = np.random.default_rng(config.seed).permutation(arrays.num_episodes)
+    held = max(1, round(config.validation_share * arrays.num_episodes))
+    if held >= arrays.num_episodes:
+        raise DataError(f"{config.dataset.root} has too few episodes: {arrays.num_episodes}")
+    parts = config.agent.waypoints
+    held_out = gather(arrays, np.sort(order[:held]), layout, parts)
+    train = gather(arrays, np.sort(order[held:]), layout, parts)
+    for name, data in (("training", train), ("held-out", held_out)):
+        if not len(data.leading):
+            raise DataError(f"{config.dataset.root}: nothing ever moves in its {name} episodes")
+    return train, held_out, layout
+
+
+def layout_of(arrays: DatasetArrays) -> Layout:
+    """Return the layout of a dataset's environment."""
+    if arrays.spec.task in TASKS:
+        return Layout.of(TASKS[arrays.spec.task])
+    spec = arrays.spec
+    return Layout(spec.observation_dim, spec.goal_dim, spec.action_dim)
+
+
+def gather(
+    arrays: DatasetArrays, episodes: np.ndarray, layout: Layout, parts: int | None
+) -> Trajectories:
+    """Copy the named episodes into memory."""
+    starts, stops = arrays.episode_start[episodes], arrays.episode_start[episodes + 1]
+    rows = np.concatenate([np.arange(a, b) for a, b in zip(starts, stops, strict=True)])
+    data = Trajectories(layout, len(rows), parts)
+    data.extend(
+        arrays.observation[rows],
+        arrays.achieved_goal[rows],
+        arrays.action[rows],
+        np.concatenate([[0], np.cumsum(stops - starts)]),
+    )
+    return data
+
+
+def prepare_run(run: Path, config: object, resume: bool, name: str) -> bool:
+    """Make the folder of a run and write its configuration; return whether to resume it."""
+    if resume and not checkpoint.exists(run):
+        raise ConfigError(f"--resume: {run} holds no checkpoint")
+    if not resume and run.exists() and any(run.iterdir()):
+        raise ConfigError(f"{run} is not empty; add --resume or choose another --output-dir")
+    try:
+        run.mkdir(parents=True, exist_ok=True)
+        save_yaml(config, run / name)
+    except OSError as error:
+        raise ConfigError(f"cannot write to {run}: {error.strerror}") from None
+    return resume
