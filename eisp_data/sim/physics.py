@@ -55,11 +55,12 @@ class Physics:
             nstep=SUBSTEPS,
             state=path,
             sensordata=sensors,
-            chunk_size=max(1, worlds // (4 * len(self._data))),
+            # Small enough that no thread waits long for the last one.
+            chunk_size=max(1, worlds // (8 * len(self._data))),
             skip_checks=True,
             initial_warmstart=None,
         )
-        return path[:, -1]
+        return path[:, -1].copy()
 
     def qpos(self, state: np.ndarray) -> np.ndarray:
         """Return the view (..., nq) of the joint positions in (..., P) states."""

@@ -27,7 +27,7 @@ SUCCESS_DISTANCE_M = 0.05
 ACTION_SCALE_M = 0.04
 """Displacement commanded by an action of 1: 1 m/s at 25 Hz, the tool speed of a UR3."""
 
-_AT_REST_M_S = 0.02
+AT_REST_M_S = 0.02
 _GRIPPER_JOINTS = 5
 
 
@@ -122,10 +122,9 @@ class Task(ABC):
     def observe(self, state: np.ndarray) -> np.ndarray:
         """Return the (N, S) float32 observations of (N, P) states."""
         qpos, qvel = self.qpos(state), self.qvel(state)
-        parts = [qpos[:, :5], qvel[:, :5]]
-        for index in range(self.blocks):
-            parts += self._block_features(qpos, qvel, index)
-        return np.concatenate(parts + self.extra_features(state), axis=1).astype(np.float32)
+        blocks = self._block_features(state).reshape(len(state), -1)
+        parts = [qpos[:, :5], qvel[:, :5], blocks, *self.extra_features(state)]
+        return np.concatenate(parts, axis=1, dtype=np.float32, casting="same_kind")
 
     def extra_features(self, state: np.ndarray) -> list[np.ndarray]:
         """Return what the fixtures add to the observation, each (N, ...)."""
@@ -138,7 +137,7 @@ class Task(ABC):
     def settled(self, state: np.ndarray) -> np.ndarray:
         """Return whether every block is at rest and no block is held, (N,) bool."""
         speeds = self._block_qvel(state)[..., :3]
-        slow = (np.linalg.norm(speeds, axis=-1) < _AT_REST_M_S).all(axis=1)
+        slow = (np.linalg.norm(speeds, axis=-1) < AT_REST_M_S).all(axis=1)
         return slow & self.hands_off(state)
 
     def hands_off(self, state: np.ndarray) -> np.ndarray:
@@ -191,17 +190,17 @@ class Task(ABC):
         start = _GRIPPER_JOINTS + self.fixtures
         return self.qvel(state)[:, start:].reshape(len(state), self.blocks, 6)
 
-    def _block_features(self, qpos: np.ndarray, qvel: np.ndarray, index: int) -> list[np.ndarray]:
-        pose_start = _GRIPPER_JOINTS + self.fixtures + 7 * index
-        velocity_start = _GRIPPER_JOINTS + self.fixtures + 6 * index
-        position = qpos[:, pose_start : pose_start + 3]
-        quaternion = qpos[:, pose_start + 3 : pose_start + 7]
-        velocity = qvel[:, velocity_start : velocity_start + 3]
-        spin = qvel[:, velocity_start + 3 : velocity_start + 6]
-        return [
-            position,
-            position - qpos[:, :3],
-            euler_from_quaternion(quaternion),
-            velocity,
-            rotate(quaternion, spin),  # MuJoCo's free joint keeps it in the frame of the body
-        ]
+    def _block_features(self, state: np.ndarray) -> np.ndarray:
+        """Return the (N, blocks, OBJECT_DIM) features of the blocks."""
+        start = _GRIPPER_JOINTS + self.fixtures
+        poses = self.qpos(state)[:, start:].reshape(len(state), self.blocks, 7)
+        velocities = self._block_qvel(state)
+        position, quaternion = poses[..., :3], poses[..., 3:]
+        features = np.empty((len(state), self.blocks, OBJECT_DIM), np.float32)
+        features[..., :3] = position
+        features[..., 3:6] = position - self.qpos(state)[:, None, :3]
+        features[..., 6:9] = euler_from_quaternion(quaternion)
+        features[..., 9:12] = velocities[..., :3]
+        # MuJoCo's free joint keeps the angular velocity in the frame of the body.
+        features[..., 12:] = rotate(quaternion, velocities[..., 3:])
+        return features
