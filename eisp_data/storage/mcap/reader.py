@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 import io
 import struct
@@ -84,13 +85,18 @@ class McapLog:
         """What the summary says the file holds."""
         self._bad_segments: dict[Segment, str] = {}
         self._unknown: dict[int, int] = {}
+        self._open = True
         self.indexed = self._read_summary()
         """The file has a summary that passes its CRC, so that any reader opens it."""
         if not self.indexed:
             for segment in self.layout.segments:
                 for _ in self._segment(segment):
                     pass
-            self._unknown.clear()
+            for opcode, body in self._bodies(self.layout.definitions):
+                with contextlib.suppress(BadRecord):
+                    self._define(opcode, body)
+        # From here on the channels are known, and a damaged definition changes nothing.
+        self._open = False
 
     def __enter__(self) -> McapLog:
         return self
@@ -171,7 +177,10 @@ class McapLog:
 
     def extras(self) -> Iterator[tuple[int, bytes]]:
         """Yield (opcode, body) of each attachment and metadata record."""
-        for opcode, offset, length in self.layout.extras:
+        yield from self._bodies(self.layout.extras)
+
+    def _bodies(self, places: list[tuple[int, int, int]]) -> Iterator[tuple[int, bytes]]:
+        for opcode, offset, length in places:
             if length > scan.MAX_RECORD_BYTES:
                 self.layout.problems.append(f"byte {offset}: record of {length} bytes left out")
                 continue
@@ -241,13 +250,13 @@ class McapLog:
         return bool(self.channels) or not self.layout.segments
 
     def _define(self, opcode: int, body: bytes) -> None:
-        if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL):
+        if not self._open or opcode not in (Opcode.SCHEMA, Opcode.CHANNEL):
             return
         definition = records.parse_definition(opcode, body)
         if isinstance(definition, Schema):
-            self.schemas[definition.id] = definition
+            self.schemas.setdefault(definition.id, definition)
         else:
-            self.channels[definition.id] = definition
+            self.channels.setdefault(definition.id, definition)
 
     def _segment(self, segment: Segment) -> Iterator[Message]:
         """Yield the messages of one segment up to the first damage, which is noted."""

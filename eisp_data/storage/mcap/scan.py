@@ -48,6 +48,8 @@ class Layout:
     segments: list[Segment] = field(default_factory=list)
     extras: list[tuple[int, int, int]] = field(default_factory=list)
     """(opcode, offset, length) of each attachment and metadata record."""
+    definitions: list[tuple[int, int, int]] = field(default_factory=list)
+    """(opcode, offset, length) of the schemas and channels that the summary repeats."""
     problems: list[str] = field(default_factory=list)
     skipped_bytes: int = 0
     """Bytes in which nothing could be recognised."""
@@ -89,7 +91,21 @@ def walk(file: BinaryIO) -> Layout:
     loose.close(layout)
     if not layout.ended:
         layout.problems.append("no end of data: the recording was cut off")
+    _note_definitions(file, at, size, layout)
     return layout
+
+
+def _note_definitions(file: BinaryIO, at: int, size: int, layout: Layout) -> None:
+    """Note what the summary repeats: its own offsets may be wrong, and a first chunk lost."""
+    try:
+        while at < size:
+            opcode, length = _header(file, at, size)
+            end = at + records.RECORD_HEADER.size + length
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                layout.definitions.append((opcode, at, end - at))
+            at = end
+    except BadRecord:
+        pass  # The summary's own reader says what is wrong with it.
 
 
 def _header(file: BinaryIO, at: int, size: int) -> tuple[int, int]:

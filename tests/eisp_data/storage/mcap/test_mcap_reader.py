@@ -145,6 +145,21 @@ def test_a_file_without_its_summary_is_read_whole(tmp_path: Path, session_file: 
         assert not log.indexed
 
 
+def test_channels_are_found_in_a_summary_that_has_moved_when_the_first_chunk_is_lost(
+    tmp_path: Path, session_file: Path
+) -> None:
+    data = session_file.read_bytes()
+    with McapLog(session_file) as log:
+        first = log.layout.segments[0]
+        lost = len(list(log._segment(first)))
+        total = len(list(log.messages()))
+    at = first.offset + 300
+    path = damaged(tmp_path / "hole.mcap", data[:at] + data[at + 50 :])
+    with McapLog(path) as log:
+        assert not log.indexed
+        assert len(list(log.messages())) == total - lost
+
+
 def test_a_chunk_that_claims_to_be_huge_is_not_believed() -> None:
     for compression, data in ((b"zstd", b"\x28\xb5\x2f\xfd" + b"\xff" * 20), (b"lz4", b"\x04\x22")):
         with pytest.raises(records.BadRecord):

@@ -249,7 +249,7 @@ def test_a_bag_with_usual_names_suggests_its_own_mapping(bag: Path) -> None:
         ("/joint_states", "", "observation.state"),
         ("/gripper", "", "observation.state"),
         ("/commands", "", "action"),
-        ("/camera/image_raw", "", "observation.images.camera"),
+        ("/camera/compressed", "", "observation.images.camera"),
         *(("/tf", f, f"observation.{to}") for f in ("block", "marker") for to in
           ("environment_state", "achieved_goal")),
     }  # fmt: skip
