@@ -83,6 +83,7 @@ class Assembler:
             for topic, n in dropped(recording.events).items()
         ]
         for source in recording.sources:
+            self._check_clock(source)
             for reason, n in source.left_out.items():
                 self.lines.append(
                     f"{log.path.name}: {source.stream.topic}: {n} samples {reason} left out"
@@ -107,6 +108,20 @@ class Assembler:
                 ended = window.outcome == "success" and part[-1] == ticks[-1]
                 yield None if number < skip else self._make(window, part, number, bool(ended))
                 number += 1
+
+    def _check_clock(self, source: Source) -> None:
+        """Raise DataError if a source never overlaps the actions: its clock must be another."""
+        commands = next(s for s in self.recording.sources if s.stream.to == "action").series
+        first, last = source.series.times_ns[[0, -1]]
+        # What is said once, like a goal or the pose of a fixed thing, may well come before.
+        at_a_rate = source.stream.camera is not None or source.stream.to == STATE
+        if first > commands.times_ns[-1] or (at_a_rate and last < commands.times_ns[0]):
+            apart_s = (first - commands.times_ns[0]) / NANOSECONDS
+            other = "log" if self.rate.clock == "hardware" else "hardware"
+            raise DataError(
+                f"{self.log.path}: {source.stream.topic} begins {apart_s:.6g} s after the actions "
+                f"and never overlaps them; if their clocks differ, set clock: {other}"
+            )
 
     def _say(self, window: Window, text: str) -> None:
         at = (window.start_ns - self._first_ns()) / NANOSECONDS

@@ -6,11 +6,11 @@ from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from eisp_data.errors import DataError
+from eisp_data.storage.checks import Check
 from eisp_data.storage.mcap import decode, pixels
 from eisp_data.storage.mcap.assemble import SHORTEST_GAP_NS
 from eisp_data.storage.mcap.reader import ChannelStats, Entry, McapLog
@@ -20,14 +20,8 @@ STUCK_MESSAGES = 50
 """A sensor that has sent the very same reading this often, and never another, is stuck."""
 LARGEST_LAG_S = 1.0
 """How far hardware and log time may differ."""
-
-
-class Check(NamedTuple):
-    """The result of one check."""
-
-    name: str
-    passed: bool
-    detail: str
+SUSPICIOUS = ("hardware times", "no gaps", "not stuck")
+"""Checks that only warn: simulated time, a paused robot and an idle gripper are no damage."""
 
 
 @dataclass
@@ -156,7 +150,8 @@ def _channels(seen: dict[str, _Seen]) -> Iterator[Check]:
     }
     for name, failed in by_channel.items():
         detail = "; ".join(f"{topic}: {text}" for topic, text in failed.items())
-        yield Check(name, not failed, detail or f"{len(seen)} channels")
+        warning = bool(failed) and name in SUSPICIOUS
+        yield Check(name, warning or not failed, detail or f"{len(seen)} channels", warning)
     rates = [f"{topic} {_rate(s):.1f} Hz" for topic, s in seen.items()]
     yield Check("rates", True, ", ".join(rates) or "no channels")
 

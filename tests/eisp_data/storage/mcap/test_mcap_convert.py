@@ -222,6 +222,18 @@ def test_a_jittering_control_loop_loses_and_doubles_no_command(tmp_path: Path) -
     assert len(episode) == 100
 
 
+def test_a_sensor_on_another_clock_is_named_with_the_way_out(tmp_path: Path) -> None:
+    with McapWriter(tmp_path / "x.mcap", FAST) as writer:
+        for k in range(10):
+            since_boot = k * PERIOD_NS
+            writer.log("/joint_states", messages.joints(["a"], [k], since_boot), since_boot)
+            at = START_NS + since_boot
+            writer.vector("/command", [0.0], at, role="action")
+            writer.vector("/reached", [k], at, role="observation.achieved_goal")
+    with pytest.raises(DataError, match=r"/joint_states begins -1\.7e\+09 s .* set clock: log"):
+        run(tmp_path / "x.mcap", tmp_path / "d")
+
+
 def test_a_dead_camera_is_reported_and_its_age_grows(tmp_path: Path) -> None:
     with McapWriter(tmp_path / "x.mcap", FAST) as writer:
         writer.event("episode_start", START_NS)
