@@ -8,22 +8,20 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 
 from eisp_data.episode import Episode
 from eisp_data.errors import DataError
 from eisp_data.storage import sidecar
-from eisp_data.storage.episodes import EpisodeIndex, episode_table, position
+from eisp_data.storage.episodes import EpisodeIndex, episode_row, episode_table, position
 from eisp_data.storage.files import sync
+from eisp_data.storage.rows import write_rows
 from eisp_data.storage.schema import (
     CHUNK_SIZE,
     DATA_PATH,
     EPISODES_PATH,
-    SIDECAR_COLUMN,
     SIM_STATE_COLUMN,
     VIDEO_PATH,
-    arrow_column,
     column_widths,
     video_key,
 )
@@ -177,15 +175,33 @@ def stage(
         target = VIDEO_PATH.format(video_key=key, chunk_index=chunk, file_index=file)
         staged.append((path, Path(target)))
     data = staging / "data.parquet"
-    _write_rows(batch, data, first_row)
+    columns = {
+        name: np.concatenate([own[name] for own in batch.columns]) for name in batch.columns[0]
+    }
+    columns["index"] = np.arange(first_row, first_row + batch.num_frames)
+    write_rows(data, columns, batch.sidecars, [len(episode) for episode in batch.episodes])
     staged.append((data, Path(DATA_PATH.format(chunk_index=chunk, file_index=file))))
     rows: list[dict[str, object]] = []
-    for episode, columns, own in zip(batch.episodes, batch.columns, stats, strict=True):
-        [own["index"]] = column_stats([first_row + columns["frame_index"]])
-        rows.append(_pointers(episode, columns, spec, first_row, number, rows))
+    frames = 0
+    for episode, own in zip(batch.episodes, stats, strict=True):
+        [own["index"]] = column_stats([first_row + np.arange(len(episode))])
+        rows.append(
+            episode_row(
+                spec,
+                episode=batch.first_episode + len(rows),
+                first_row=first_row,
+                data_file=number,
+                video={camera: (number, frames) for camera in spec.cameras},
+                success=episode.success[1:],
+                reward=episode.reward,
+                seed=episode.seed,
+                info=sidecar.plain_info(episode.info),
+            )
+        )
         first_row += len(episode)
+        frames += len(episode)
     table = staging / "episodes.parquet"
-    pq.write_table(episode_table(rows, stats, number), table)
+    pq.write_table(episode_table(rows, stats, number), table, write_page_checksum=True)
     staged.append((table, Path(EPISODES_PATH.format(chunk_index=chunk, file_index=file))))
     for path, _ in staged:
         sync(path)
@@ -195,68 +211,6 @@ def stage(
 def _frames(batch: Batch, camera: str) -> Iterator[np.ndarray]:
     for episode in batch.episodes:
         yield from episode.images[camera][:-1]
-
-
-def _write_rows(batch: Batch, path: Path, first_row: int) -> None:
-    merged = {
-        name: np.concatenate([columns[name] for columns in batch.columns])
-        for name in batch.columns[0]
-    }
-    merged["index"] = np.arange(first_row, first_row + batch.num_frames)
-    arrays = {name: arrow_column(values) for name, values in merged.items()}
-    texts = [""] * batch.num_frames
-    starts = np.cumsum([0, *(len(episode) for episode in batch.episodes)])
-    for start, text in zip(starts, batch.sidecars, strict=False):
-        texts[start] = text
-    arrays[SIDECAR_COLUMN] = pa.array(texts)
-    table = pa.table(arrays)
-    plain = [n for n, v in merged.items() if v.dtype.kind == "f" and "desired" not in n]
-    with pq.ParquetWriter(
-        path,
-        table.schema,
-        compression="snappy",
-        use_dictionary=[n for n in table.column_names if n not in plain],
-    ) as writer:
-        # One row group per episode, as LeRobot's writer does, for reading at random.
-        for start, stop in zip(starts[:-1], starts[1:], strict=True):
-            writer.write_table(table.slice(start, stop - start))
-
-
-def _pointers(
-    episode: Episode,
-    columns: Mapping[str, np.ndarray],
-    spec: DatasetSpec,
-    first_row: int,
-    number: int,
-    earlier: Sequence[Mapping[str, object]],
-) -> dict[str, object]:
-    """Return an episode's row of ``meta/episodes`` without its statistics."""
-    chunk, file = position(number)
-    info = sidecar.plain_info(episode.info)
-    noise = info.get("noise")
-    row: dict[str, object] = {
-        "episode_index": int(columns["episode_index"][0]),
-        "tasks": [spec.instruction],
-        "length": len(episode),
-        "data/chunk_index": chunk,
-        "data/file_index": file,
-        "dataset_from_index": first_row,
-        "dataset_to_index": first_row + len(episode),
-        "success": bool(episode.success[-1]),
-        "return": float(episode.reward.sum(dtype=np.float64)),
-        "seed": int(episode.seed),
-        "policy": str(info.get("policy", "")),
-        "operator": str(info.get("operator", "")),
-        "noise": float(noise) if isinstance(noise, int | float) else float("nan"),
-    }
-    frames_before = sum(int(str(other["length"])) for other in earlier)
-    for camera in spec.cameras:
-        key = f"videos/{video_key(camera)}"
-        row[f"{key}/chunk_index"] = chunk
-        row[f"{key}/file_index"] = file
-        row[f"{key}/from_timestamp"] = frames_before / spec.fps
-        row[f"{key}/to_timestamp"] = (frames_before + len(episode)) / spec.fps
-    return row
 
 
 def remove_orphans(index: EpisodeIndex, spec: DatasetSpec) -> int:

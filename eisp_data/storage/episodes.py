@@ -15,8 +15,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from eisp_data.episode import Scalar
 from eisp_data.errors import DataError
+from eisp_data.storage.files import one_line
 from eisp_data.storage.schema import CHUNK_SIZE, DATA_PATH, EPISODES_PATH, VIDEO_PATH, video_key
+from eisp_data.storage.spec import DatasetSpec
 from eisp_data.storage.stats import Stats
 
 POINTERS = ("episode_index", "length", "data/chunk_index", "data/file_index", "dataset_from_index")
@@ -63,15 +66,21 @@ def position(number: int) -> tuple[int, int]:
     return number // CHUNK_SIZE, number % CHUNK_SIZE
 
 
-def read_parquet(path: Path, columns: list[str] | None = None) -> pa.Table:
-    """Read a parquet file whole; DataError naming it if it is missing, cut or damaged."""
+def read_parquet(
+    path: Path, columns: list[str] | None = None, row_group: int | None = None
+) -> pa.Table:
+    """Read a parquet file or one of its row groups; DataError if it is missing, cut or damaged."""
     try:
         # One handle, one thread: a damaged page raises here instead of in a pool.
-        return pq.ParquetFile(path, memory_map=False).read(columns=columns, use_threads=False)
+        # Our own files carry a checksum of each page; others are read without.
+        file = pq.ParquetFile(path, page_checksum_verification=True)
+        if row_group is not None:
+            return file.read_row_group(row_group, columns=columns, use_threads=False)
+        return file.read(columns=columns, use_threads=False)
     except FileNotFoundError:
         raise DataError(f"{path}: no such file") from None
     except (OSError, pa.ArrowException, ValueError, KeyError) as error:
-        raise DataError(f"{path}: not a readable parquet file ({_first_line(error)})") from None
+        raise DataError(f"{path}: not a readable parquet file ({one_line(error)})") from None
 
 
 def read_index(root: Path) -> EpisodeIndex:
@@ -132,7 +141,7 @@ def _pointer_columns(path: Path) -> list[str]:
     try:
         names = pq.read_schema(path).names
     except (OSError, pa.ArrowException) as error:
-        raise DataError(f"{path}: not a readable parquet file ({_first_line(error)})") from None
+        raise DataError(f"{path}: not a readable parquet file ({one_line(error)})") from None
     missing = [name for name in POINTERS if name not in names]
     if missing:
         raise DataError(f"{path}: column(s) {missing} are missing")
@@ -149,8 +158,57 @@ def _integers(table: pa.Table, name: str, path: Path) -> np.ndarray:
         raise DataError(f"{path}: column {name} is missing or does not hold integers") from None
 
 
-def _first_line(error: BaseException) -> str:
-    return str(error).splitlines()[0] if str(error) else type(error).__name__
+def episode_row(
+    spec: DatasetSpec,
+    *,
+    episode: int,
+    first_row: int,
+    data_file: int,
+    video: Mapping[str, tuple[int, int]],
+    success: np.ndarray,
+    reward: np.ndarray,
+    seed: int,
+    info: Mapping[str, Scalar],
+) -> dict[str, Any]:
+    """Return an episode's row of ``meta/episodes`` without its statistics.
+
+    Beside LeRobot's pointers it has what one filters episodes by: success at the last
+    observation, return, seed, policy, operator and noise.
+
+    Args:
+        spec: the dataset's.
+        episode: its number in the dataset.
+        first_row: its first ``index``.
+        data_file: number of the file that holds its rows.
+        video: camera to the number of the video file and the first frame in it.
+        success: (T,) bool, ``next.success``.
+        reward: (T,) float32.
+        seed: of the episode.
+        info: of the episode.
+    """
+    chunk, file = position(data_file)
+    noise = info.get("noise")
+    row: dict[str, Any] = {
+        "episode_index": episode,
+        "tasks": [spec.instruction],
+        "length": len(reward),
+        "data/chunk_index": chunk,
+        "data/file_index": file,
+        "dataset_from_index": first_row,
+        "dataset_to_index": first_row + len(reward),
+        "success": bool(success[-1]),
+        "return": float(reward.sum(dtype=np.float64)),
+        "seed": int(seed),
+        "policy": str(info.get("policy", "")),
+        "operator": str(info.get("operator", "")),
+        "noise": float(noise) if isinstance(noise, int | float) else float("nan"),
+    }
+    for camera, (number, frame) in video.items():
+        key = f"videos/{video_key(camera)}"
+        row[f"{key}/chunk_index"], row[f"{key}/file_index"] = position(number)
+        row[f"{key}/from_timestamp"] = frame / spec.fps
+        row[f"{key}/to_timestamp"] = (frame + len(reward)) / spec.fps
+    return row
 
 
 def episode_table(

@@ -14,6 +14,11 @@ from eisp_data.errors import DataError
 _LOCKED_HERE: set[str] = set()
 
 
+def one_line(error: BaseException) -> str:
+    """Return what an error says as one line; some libraries say it in several."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
 def sync(path: Path) -> None:
     """Force a file or a folder's entries to the disk, so that a cut cable cannot undo them."""
     descriptor = os.open(path, os.O_RDONLY)

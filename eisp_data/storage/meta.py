@@ -117,7 +117,9 @@ def compact_episodes(root: Path) -> None:
         zeros = pa.array(np.zeros(table.num_rows, dtype=np.int64))
         for name in ("meta/episodes/chunk_index", "meta/episodes/file_index"):
             table = table.set_column(table.column_names.index(name), name, zeros)
-        replace_atomically(first, lambda temporary: pq.write_table(table, temporary))
+        replace_atomically(
+            first, lambda temporary: pq.write_table(table, temporary, write_page_checksum=True)
+        )
     for path in (*index.tables, *index.stale):
         if path != first:
             path.unlink(missing_ok=True)

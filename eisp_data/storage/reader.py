@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from eisp_data.episode import Episode
 from eisp_data.errors import DataError
-from eisp_data.storage.episodes import EpisodeIndex, read_index, read_parquet
+from eisp_data.storage.episodes import EpisodeIndex, read_index
 from eisp_data.storage.files import read_json
 from eisp_data.storage.meta import SIDECAR_PATH
+from eisp_data.storage.rows import as_table, column_values, read_rows
 from eisp_data.storage.schema import SIDECAR_COLUMN, SIM_STATE_COLUMN, column_widths
 from eisp_data.storage.sidecar import Sidecar, decode
 from eisp_data.storage.spec import DatasetSpec
@@ -80,9 +80,9 @@ def _shared(root: Path) -> tuple[DatasetSpec, dict[str, Any]]:
 def read_sidecars(root: Path, index: EpisodeIndex) -> list[Sidecar]:
     """Return the sidecar of every episode, without reading any other column."""
     texts: list[Sidecar] = []
-    for first, stop in _runs(index):
+    for first, stop in runs(index):
         path = index.data_path(first)
-        table = _read_rows(path, [SIDECAR_COLUMN, "episode_index"])
+        table = read_rows(path, [SIDECAR_COLUMN, "episode_index"])
         starts = _starts(table, path, index, first, stop)
         texts += _sidecars(table, path, starts, first)
     return texts
@@ -97,13 +97,13 @@ def read_blocks(root: Path, spec: DatasetSpec) -> Iterator[Block]:
     """
     index = read_index(root)
     kinds = column_widths(spec)
-    for first, stop in _runs(index):
+    for first, stop in runs(index):
         path = index.data_path(first)
-        table = _read_rows(path, [*kinds, SIDECAR_COLUMN])
+        table = read_rows(path, [*kinds, SIDECAR_COLUMN])
         starts = _starts(table, path, index, first, stop)
         rows = slice(starts[0], starts[-1])
         columns = {
-            name: _numbers(table, name, dtype, width, path)[rows]
+            name: column_values(table, name, dtype, width, path)[rows]
             for name, (dtype, width) in kinds.items()
         }
         for name, values in columns.items():
@@ -131,21 +131,22 @@ def read_episodes(root: Path | str, images: bool = False) -> Iterator[Episode]:
             number = block.first_episode + offset
             frames = _images(index, number, sidecar, spec) if images else {}
             try:
-                yield _episode({n: v[rows] for n, v in block.columns.items()}, sidecar, frames)
+                yield build_episode({n: v[rows] for n, v in block.columns.items()}, sidecar, frames)
             except DataError as error:
                 raise DataError(f"{block.path}: episode {number}: {error}") from None
 
 
-def _episode(
+def build_episode(
     columns: Mapping[str, np.ndarray], sidecar: Sidecar, images: Mapping[str, np.ndarray]
 ) -> Episode:
+    """Return the Episode of its rows, (T,) or (T, D) each, and its sidecar."""
     steps = len(columns["action"])
     goals = columns["observation.desired_goal"].reshape(steps, -1)
     if (goals != goals[0]).any():
         raise DataError("observation.desired_goal changes within the episode")
 
     def with_last(name: str, last: np.ndarray) -> np.ndarray:
-        return np.concatenate([_table(columns[name]), last[None]])
+        return np.concatenate([as_table(columns[name]), last[None]])
 
     observation = with_last("observation.state", sidecar.observation[: sidecar.spec.proprio_dim])
     if "observation.environment_state" in columns:
@@ -157,12 +158,12 @@ def _episode(
         observation=observation,
         achieved_goal=with_last("observation.achieved_goal", sidecar.achieved_goal),
         desired_goal=goals[0].copy(),
-        action=_table(columns["action"]).copy(),
+        action=as_table(columns["action"]).copy(),
         reward=columns["next.reward"].copy(),
         done=columns["next.done"].copy(),
         truncated=columns["next.truncated"].copy(),
         success=np.concatenate([[sidecar.first_success], columns["next.success"]]),
-        sim_state=np.concatenate([_table(states), sidecar.sim_state[None]]),
+        sim_state=np.concatenate([as_table(states), sidecar.sim_state[None]]),
         seed=sidecar.seed,
         info=sidecar.info,
         images=images,
@@ -183,12 +184,7 @@ def _images(
     return images
 
 
-def _table(values: np.ndarray) -> np.ndarray:
-    """Return (N,) or (N, D) as (N, D)."""
-    return values.reshape(len(values), -1) if values.ndim == 1 else values
-
-
-def _runs(index: EpisodeIndex) -> Iterator[tuple[int, int]]:
+def runs(index: EpisodeIndex) -> Iterator[tuple[int, int]]:
     """Yield (first, stop) of the episodes that lie in one data file one after the other."""
     first = 0
     for episode in range(1, len(index) + 1):
@@ -197,22 +193,9 @@ def _runs(index: EpisodeIndex) -> Iterator[tuple[int, int]]:
             first = episode
 
 
-def _read_rows(path: Path, columns: list[str]) -> pa.Table:
-    try:
-        names = pq.read_schema(path).names
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such file") from None
-    except (OSError, pa.ArrowException) as error:
-        raise DataError(f"{path}: not a readable parquet file ({error})") from None
-    missing = [name for name in columns if name not in names]
-    if missing:
-        raise DataError(f"{path}: column(s) {missing} are missing")
-    return read_parquet(path, columns)
-
-
 def _starts(table: pa.Table, path: Path, index: EpisodeIndex, first: int, stop: int) -> np.ndarray:
     """Return (E + 1,) row offsets of episodes ``first`` to ``stop - 1`` in a file's table."""
-    numbers = _numbers(table, "episode_index", "int64", 1, path)
+    numbers = column_values(table, "episode_index", "int64", 1, path)
     begins = np.searchsorted(numbers, np.arange(first, stop + 1))
     lengths = np.diff(begins)
     wrong = np.flatnonzero(lengths != index.length[first:stop])
@@ -236,34 +219,12 @@ def _sidecars(table: pa.Table, path: Path, starts: np.ndarray, first: int) -> li
     ]
 
 
-def _numbers(table: pa.Table, name: str, dtype: str, width: int, path: Path) -> np.ndarray:
-    """Return a column as (N,), or (N, width) if wider; DataError if it is anything else."""
-    try:
-        column = table[name].combine_chunks()
-        if isinstance(column, pa.ChunkedArray):
-            column = pa.concat_arrays(column.chunks)
-        is_list = pa.types.is_list(column.type) or pa.types.is_large_list(column.type)
-        if is_list or pa.types.is_fixed_size_list(column.type):
-            column = column.flatten() if column.null_count == 0 else column
-        if column.null_count:
-            raise DataError(f"{path}: column {name} has empty cells")
-        values = column.to_numpy(zero_copy_only=False)
-    except pa.ArrowException as error:
-        raise DataError(f"{path}: column {name} cannot be read ({error})") from None
-    if values.dtype != np.dtype(dtype) or values.size != table.num_rows * width:
-        raise DataError(
-            f"{path}: column {name}: expected {width} x {dtype} a row; "
-            f"got {values.size / max(table.num_rows, 1):g} x {values.dtype}"
-        )
-    return values if width == 1 else values.reshape(-1, width)
-
-
 def _check_finite(
     values: np.ndarray, name: str, path: Path, starts: np.ndarray, first: int
 ) -> None:
     if values.dtype.kind != "f" or np.isfinite(values).all():
         return
-    row = int(np.argwhere(~np.isfinite(_table(values)))[0][0])
+    row = int(np.argwhere(~np.isfinite(as_table(values)))[0][0])
     episode = int(np.searchsorted(starts, row, side="right")) - 1
     raise DataError(
         f"{path}: column {name}: not finite in episode {first + episode}, "

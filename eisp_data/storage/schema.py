@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-import pyarrow as pa
-
 from eisp_data.storage.spec import DatasetSpec
 
 CODEBASE_VERSION = "v3.0"
@@ -77,13 +74,3 @@ def features(spec: DatasetSpec, video_info: dict[str, Any]) -> dict[str, Any]:
             "info": {"video.height": height, "video.width": width, **video_info},
         }
     return table
-
-
-def arrow_column(values: np.ndarray) -> pa.Array:
-    """Return (N,) or (N, D) values as LeRobot stores them: scalars, or lists of fixed size."""
-    if values.ndim == 1:
-        return pa.array(values)
-    if values.shape[1] == 1:
-        return pa.array(np.ascontiguousarray(values[:, 0]))
-    flat = pa.array(np.ascontiguousarray(values).reshape(-1))
-    return pa.FixedSizeListArray.from_arrays(flat, values.shape[1])

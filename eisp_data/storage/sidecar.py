@@ -21,6 +21,7 @@ import numpy as np
 
 from eisp_data.episode import Episode, Scalar
 from eisp_data.errors import DataError
+from eisp_data.storage.files import one_line
 from eisp_data.storage.spec import DatasetSpec
 from eisp_data.storage.video import decode_jpeg, encode_jpeg
 
@@ -31,6 +32,8 @@ FORMAT = 1
 class Sidecar:
     """One episode's sidecar, decoded."""
 
+    steps: int
+    """T: a file that ends before has lost part of the episode."""
     seed: int
     info: dict[str, Scalar]
     first_success: bool
@@ -79,6 +82,7 @@ def encode(episode: Episode, shared: str) -> str:
     }
     own = {
         "eisp": FORMAT,
+        "steps": len(episode),
         "seed": int(episode.seed),
         "info": plain_info(episode.info),
         "first_success": bool(episode.success[0]),
@@ -98,6 +102,7 @@ def decode(text: str, where: str) -> Sidecar:
         spec = DatasetSpec.from_json(value["spec"])
         final = value["final"]
         sidecar = Sidecar(
+            steps=int(value["steps"]),
             seed=int(value["seed"]),
             info=plain_info(value["info"]),
             first_success=bool(value["first_success"]),
@@ -111,7 +116,7 @@ def decode(text: str, where: str) -> Sidecar:
     except DataError:
         raise
     except (ValueError, KeyError, TypeError, AttributeError, binascii.Error, RecursionError) as bad:
-        reason = f"{type(bad).__name__}: {bad}"
+        reason = f"{type(bad).__name__}: {one_line(bad)}"
         raise DataError(f"{where}: the sidecar cannot be read ({reason})") from None
     if set(sidecar.images) != set(spec.cameras):
         raise DataError(

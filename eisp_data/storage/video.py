@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from eisp_data.errors import DataError
+from eisp_data.storage.files import one_line
 
 CODEC = "h264"
 OPTIONS = {"crf": "23", "preset": "veryfast", "g": "2", "bf": "0"}
@@ -81,7 +82,8 @@ def decode_video(path: Path, start: int, stop: int, fps: int) -> Iterator[np.nda
     try:
         with av.open(str(path)) as container:
             stream = container.streams.video[0]
-            stream.thread_type = "AUTO"
+            # Starting threads costs more than decoding a few small frames.
+            stream.thread_type = "AUTO" if stop - start > 200 else "NONE"
             base = stream.time_base or Fraction(1, fps)
             container.seek(max(0, round(start / fps / base)), stream=stream, backward=True)
             for frame in container.decode(stream):
@@ -91,10 +93,28 @@ def decode_video(path: Path, start: int, stop: int, fps: int) -> Iterator[np.nda
                     break
                 yield frame.to_ndarray(format="rgb24")
                 wanted += 1
-    except (OSError, ValueError, IndexError) as error:
-        raise DataError(f"{path}: frame {wanted} cannot be decoded ({error})") from None
+    except (av.FFmpegError, OSError, ValueError, IndexError, AttributeError) as error:
+        raise DataError(f"{path}: frame {wanted} cannot be decoded ({one_line(error)})") from None
     if wanted < stop:
         raise DataError(f"{path}: ends at frame {wanted}; frames up to {stop} were expected")
+
+
+def count_frames(path: Path) -> tuple[int, tuple[int, int]]:
+    """Return how many frames a video's packets hold and its (height, width), without decoding.
+
+    Raises:
+        DataError: the file is missing or no video.
+    """
+    import av
+
+    try:
+        with av.open(str(path)) as container:
+            stream = container.streams.video[0]
+            frames = sum(packet.size > 0 for packet in container.demux(stream))
+            size = (stream.codec_context.height, stream.codec_context.width)
+    except (av.FFmpegError, OSError, ValueError, IndexError, AttributeError) as error:
+        raise DataError(f"{path}: not a readable video ({one_line(error)})") from None
+    return frames, size
 
 
 def encode_jpeg(image: np.ndarray) -> bytes:
@@ -113,4 +133,4 @@ def decode_jpeg(data: bytes) -> np.ndarray:
     try:
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
     except (OSError, ValueError, SyntaxError) as error:
-        raise DataError(f"a JPEG image cannot be decoded ({error})") from None
+        raise DataError(f"a JPEG image cannot be decoded ({one_line(error)})") from None

@@ -1,4 +1,4 @@
-"""LeRobot's own code on our datasets: it opens them, edits them, trains on them; nothing is lost."""
+"""LeRobot's own code on our datasets: it opens, edits and trains on them, and loses nothing."""
 
 from __future__ import annotations
 

@@ -1,0 +1,29 @@
+"""``eisp-data convert``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+from tqdm import tqdm
+
+from eisp_data.storage.mcap.convert import ConvertConfig
+from eisp_data.storage.mcap.convert import convert as convert_recordings
+
+
+@dataclass(frozen=True, kw_only=True)
+class Convert(ConvertConfig):
+    """Options of ``eisp-data convert``."""
+
+    inputs: tyro.conf.Positional[tuple[Path, ...]]
+    """MCAP files, or folders of them (ROS 2 bags are such folders), in this order."""
+
+
+def convert(options: tyro.conf.OmitArgPrefixes[Convert]) -> None:
+    """Make a LeRobot dataset of MCAP recordings or ROS 2 bags; print what was left out."""
+    with tqdm(desc="episodes", unit="") as bar:
+        report = convert_recordings(options, lambda episodes: bar.update(episodes - bar.n) and None)
+    for line in report.lines:
+        print(line)
+    print(f"{report.episodes} episodes, {report.frames} frames in {options.to}")

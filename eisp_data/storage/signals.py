@@ -1,0 +1,117 @@
+"""What the numbers of a dataset look like: channels that are stuck, lag, success, extremes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from eisp_data.storage.checks import Check
+from eisp_data.storage.reader import Block
+from eisp_data.storage.rows import as_table
+from eisp_data.storage.spec import DatasetSpec
+
+STUCK_STEPS = 25
+"""Steps without any change after which a channel that moves in other episodes is stuck."""
+MOST_STEPS = 20_000
+"""Rows from which the lag is estimated."""
+LARGEST_LAG = 10
+SUSPICIOUS_LAG = 3
+"""Steps between an action and its effect; more smells of clocks that disagree."""
+CLEAR_CORRELATION = 0.3
+
+
+class Collected:
+    """Gathers, block by block, what the checks of the signals need; memory is bounded."""
+
+    def __init__(self, spec: DatasetSpec) -> None:
+        self._fps = spec.fps
+        self.rows = 0
+        self.extremes: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        """Column to its (D,) minimum and maximum."""
+        self._moves: dict[str, list[np.ndarray]] = {"observation.state": [], "action": []}
+        self._lengths: list[int] = []
+        self._pairs: list[tuple[np.ndarray, np.ndarray]] = []
+        self._paired = 0
+        self._last: list[bool] = []
+        self._any: list[bool] = []
+
+    def add(self, block: Block) -> None:
+        """Look at the rows of a block."""
+        self.rows += int(block.starts[-1])
+        for name, values in block.columns.items():
+            table = as_table(values)
+            low, high = table.min(axis=0), table.max(axis=0)
+            if name in self.extremes:
+                low = np.minimum(low, self.extremes[name][0])
+                high = np.maximum(high, self.extremes[name][1])
+            self.extremes[name] = (low, high)
+        for offset, start in enumerate(block.starts[:-1]):
+            rows = slice(int(start), int(block.starts[offset + 1]))
+            for name, moves in self._moves.items():
+                moves.append(np.ptp(as_table(block.columns[name][rows]), axis=0) > 0)
+            self._lengths.append(rows.stop - rows.start)
+            success = block.columns["next.success"][rows]
+            self._last.append(bool(success[-1]))
+            self._any.append(bool(success.any() or block.sidecars[offset].first_success))
+            if self._paired < MOST_STEPS and rows.stop - rows.start > 2 * LARGEST_LAG:
+                states = as_table(block.columns["observation.state"][rows])
+                actions = as_table(block.columns["action"][rows])
+                self._pairs.append((states.astype(np.float64), actions.astype(np.float64)))
+                self._paired += len(states)
+
+    def stuck(self) -> Check:
+        """Find channels that move in most episodes and not at all in a long one."""
+        found = []
+        for name, moves in self._moves.items():
+            moved = np.stack(moves)
+            usual = moved.mean(axis=0) > 0.5
+            for episode, component in np.argwhere(~moved & usual):
+                if self._lengths[episode] >= STUCK_STEPS:
+                    found.append(f"{name}[{component}] in episode {episode}")
+        more = f" and {len(found) - 3} more" if len(found) > 3 else ""
+        detail = ", ".join(found[:3]) + more or "none"
+        return Check("stuck channels", True, detail, warning=bool(found))
+
+    def lag(self) -> Check:
+        """Estimate how many steps after an action the robot's state shows it.
+
+        The change of every state from row to row is correlated with every action some steps
+        before; the lag of the clearest pair counts.
+        """
+        best, best_lag = 0.0, 0
+        for lag in range(LARGEST_LAG + 1):
+            strength = _correlation(self._pairs, lag)
+            if strength > best + 1e-9:
+                best, best_lag = strength, lag
+        if best < CLEAR_CORRELATION:
+            return Check("action lag", True, f"not clear (correlation {best:.2f} at most)")
+        late = best_lag > SUSPICIOUS_LAG
+        text = f"{best_lag} step(s), {1000 * best_lag / self._fps:.0f} ms (correlation {best:.2f})"
+        return Check("action lag", True, text, warning=late)
+
+    def success(self) -> str:
+        """Return the shares of episodes that succeed at the last and at any observation."""
+        count = len(self._last)
+        at_last, at_any = sum(self._last), sum(self._any)
+        return (
+            f"{at_last} of {count} at the last observation ({at_last / count:.1%}), "
+            f"{at_any} at any ({at_any / count:.1%})"
+        )
+
+
+def _correlation(pairs: list[tuple[np.ndarray, np.ndarray]], lag: int) -> float:
+    """Return the largest |correlation| of a state's change and an action ``lag`` steps before.
+
+    ``state[t + 1] - state[t]`` is the change that action t makes when there is no lag.
+    """
+    changes, actions = [], []
+    for state, action in pairs:
+        change = np.diff(state, axis=0)
+        changes.append(change[lag:])
+        actions.append(action[: len(change) - lag])
+    if not changes:
+        return 0.0
+    x, y = np.concatenate(changes), np.concatenate(actions)
+    x, y = x - x.mean(axis=0), y - y.mean(axis=0)
+    scale = np.sqrt(np.outer((x**2).sum(axis=0), (y**2).sum(axis=0)))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return float(np.nan_to_num(np.abs(x.T @ y) / scale, posinf=0.0).max())

@@ -1,0 +1,243 @@
+"""Every check that a dataset should pass, by name, each run even if another fails."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from eisp_data.errors import DataError
+from eisp_data.storage import signals
+from eisp_data.storage.checks import Check
+from eisp_data.storage.episodes import EpisodeIndex, read_index, read_parquet
+from eisp_data.storage.files import one_line, read_json
+from eisp_data.storage.reader import Block, check_version, read_blocks, read_spec
+from eisp_data.storage.schema import INDEX_FEATURES, SIDECAR_COLUMN, column_widths
+from eisp_data.storage.spec import DatasetSpec
+from eisp_data.storage.video import count_frames, decode_video
+
+TIMESTAMP_TOLERANCE_S = 1e-4
+"""LeRobot's own."""
+
+
+def validate(root: Path | str) -> list[Check]:
+    """Run every check on a dataset and return the results, in a fixed order.
+
+    A check that cannot be run because an earlier one failed is left out; a damaged file is a
+    failed check, not an error.
+
+    Raises:
+        DataError: ``root`` is not a LeRobot v3 dataset at all.
+    """
+    root = Path(root)
+    info = check_version(root)
+    results: list[Check] = []
+
+    def run(name: str, check: Callable[[], Check | str]) -> bool:
+        """Add the result of a check; a string is the detail of a passed one."""
+        try:
+            result = check()
+        except DataError as error:
+            result = Check(name, False, str(error).replace(f"{root}/", ""))
+        except RecursionError:
+            result = Check(name, False, "nested too deeply to be read")
+        results.append(Check(name, True, result) if isinstance(result, str) else result)
+        return results[-1].passed
+
+    found: dict[str, Any] = {}
+
+    def keep(name: str, value: Any, detail: str) -> str:
+        found[name] = value
+        return detail
+
+    run("spec", lambda: keep("spec", spec := read_spec(root), f"{spec.task}, {spec.fps} Hz"))
+    run(
+        "episode table",
+        lambda: keep("index", index := read_index(root), f"{len(index)} episodes"),
+    )
+    if "index" in found:
+        run("episode count", lambda: _episode_count(info, found["index"]))
+        run("frame count", lambda: _frame_count(info, found["index"]))
+        run("no stray files", lambda: _stray(found["index"]))
+    if len(found) == 2:
+        _check_rows(root, info, found["spec"], found["index"], run)
+        if found["spec"].cameras:
+            run("video frames", lambda: _video_counts(found["index"], found["spec"]))
+            run("video ends", lambda: _video_ends(found["index"], found["spec"]))
+    return results
+
+
+def _check_rows(
+    root: Path,
+    info: dict[str, Any],
+    spec: DatasetSpec,
+    index: EpisodeIndex,
+    run: Callable[[str, Callable[[], Check | str]], bool],
+) -> None:
+    """Run the checks that need the rows."""
+    run("features", lambda: _features(info, spec, index))
+    run("tasks", lambda: _tasks(root, spec))
+    collected = signals.Collected(spec)
+
+    def read() -> str:
+        for block in read_blocks(root, spec):
+            collected.add(block)
+            _indices(block, index)
+            _sidecar_lengths(block)
+        return f"{collected.rows} rows, no NaN; sidecar of every episode"
+
+    if run("rows", read) and collected.rows:
+        run("timestamps", lambda: f"frame_index / {spec.fps} within {TIMESTAMP_TOLERANCE_S} s")
+        run("statistics", lambda: _statistics(root, collected))
+        run("stuck channels", collected.stuck)
+        run("action lag", collected.lag)
+        run("success", collected.success)
+
+
+def _episode_count(info: dict[str, Any], index: EpisodeIndex) -> Check:
+    stated = info.get("total_episodes")
+    return Check("episode count", stated == len(index), f"{len(index)} found, {stated} stated")
+
+
+def _frame_count(info: dict[str, Any], index: EpisodeIndex) -> Check:
+    rows = 0
+    for path in sorted({index.data_path(e) for e in range(len(index))}):
+        try:
+            rows += pq.read_metadata(path).num_rows
+        except (OSError, pa.ArrowException) as error:
+            raise DataError(f"{path}: {one_line(error)}") from None
+    listed, stated = int(index.length.sum()), info.get("total_frames")
+    same = rows == listed == stated
+    detail = f"{rows} rows, {listed} in the episode table, {stated} stated"
+    return Check("frame count", same, detail)
+
+
+def _stray(index: EpisodeIndex) -> Check:
+    used = {index.data_path(e) for e in range(len(index))} | set(index.tables)
+    for camera in index.video_file:
+        used |= {index.video_path(e, camera) for e in range(len(index))}
+    folders = ("data", "videos", "meta/episodes")
+    here = [p for f in folders for p in (index.root / f).rglob("*") if p.is_file()]
+    stray = sorted(p.relative_to(index.root).as_posix() for p in here if p not in used)
+    if (index.root / ".staging").exists():
+        stray.append(".staging")
+    return Check("no stray files", not stray, ", ".join(stray[:3]) or "every file is in use")
+
+
+def _features(info: dict[str, Any], spec: DatasetSpec, index: EpisodeIndex) -> str:
+    declared = info.get("features")
+    if not isinstance(declared, dict):
+        raise DataError("info.json: features is missing")
+    expected = {n: (dtype, [width]) for n, (dtype, width) in column_widths(spec).items()}
+    expected[SIDECAR_COLUMN] = ("string", [1])
+    for name, (dtype, shape) in expected.items():
+        entry = declared.get(name)
+        if not isinstance(entry, dict):
+            raise DataError(f"info.json: feature {name} is missing")
+        if (entry.get("dtype"), entry.get("shape")) != (dtype, shape):
+            raise DataError(
+                f"info.json: feature {name} is {entry.get('dtype')} {entry.get('shape')}; "
+                f"the spec says {dtype} {shape}"
+            )
+    for camera in spec.cameras:
+        if camera not in index.video_file:
+            raise DataError(f"meta/episodes: no video of camera {camera!r}")
+    return f"{len(declared)} columns and cameras"
+
+
+def _tasks(root: Path, spec: DatasetSpec) -> Check:
+    table = read_parquet(root / "meta/tasks.parquet")
+    texts = table.column("task").to_pylist() if "task" in table.column_names else []
+    same = texts == [spec.instruction]
+    return Check("tasks", same, f"{texts}" if same else f"{texts}; expected [{spec.instruction!r}]")
+
+
+def _indices(block: Block, index: EpisodeIndex) -> None:
+    """Raise DataError unless a block's index columns count as they should."""
+    for offset, start in enumerate(block.starts[:-1]):
+        episode = block.first_episode + offset
+        rows = slice(start, block.starts[offset + 1])
+        steps = np.arange(index.length[episode])
+        columns = {n: block.columns[n][rows] for n in ("frame_index", "index", "timestamp")}
+        where = f"{block.path}: episode {episode}"
+        if not np.array_equal(columns["frame_index"], steps):
+            raise DataError(f"{where}: frame_index does not count from 0 in steps of one")
+        if not np.array_equal(columns["index"], index.first_row[episode] + steps):
+            raise DataError(f"{where}: index does not count from {index.first_row[episode]}")
+        late = np.abs(columns["timestamp"] - steps / block.sidecars[offset].spec.fps)
+        if late.max() > TIMESTAMP_TOLERANCE_S:
+            row = int(late.argmax())
+            raise DataError(f"{where}: timestamp of row {row} is {late[row]:.4g} s off")
+
+
+def _sidecar_lengths(block: Block) -> None:
+    for offset, sidecar in enumerate(block.sidecars):
+        rows = int(block.starts[offset + 1] - block.starts[offset])
+        if sidecar.steps != rows:
+            raise DataError(
+                f"{block.path}: episode {block.first_episode + offset}: {rows} rows; "
+                f"it was recorded with {sidecar.steps}"
+            )
+
+
+def _statistics(root: Path, collected: signals.Collected) -> str:
+    stored = read_json(root / "meta/stats.json")
+    # LeRobot's tools renumber the index columns and leave their statistics as they were.
+    measured = {n: v for n, v in collected.extremes.items() if n not in INDEX_FEATURES}
+    for name, (low, high) in measured.items():
+        try:
+            column = stored[name]
+            values = {k: np.asarray(column[k], dtype=np.float64) for k in ("min", "max", "count")}
+        except (KeyError, TypeError, ValueError):
+            raise DataError(f"meta/stats.json: {name} is missing or incomplete") from None
+        if values["count"].tolist() != [collected.rows]:
+            raise DataError(
+                f"meta/stats.json: {name} counts {values['count'].tolist()} rows; "
+                f"there are {collected.rows}"
+            )
+        for word, there, here in (
+            ("minimum", values["min"], low),
+            ("maximum", values["max"], high),
+        ):
+            if there.shape != here.shape or not np.allclose(there, here, rtol=1e-5, atol=1e-6):
+                raise DataError(f"meta/stats.json: {name}: the {word} is not that of the rows")
+    return f"counts and extremes of {len(measured)} columns agree with the rows"
+
+
+def _video_files(index: EpisodeIndex, spec: DatasetSpec) -> Iterator[tuple[str, Path, int]]:
+    """Yield camera, video file and how many frames its episodes need."""
+    for camera in spec.cameras:
+        needed: dict[Path, int] = {}
+        for episode in range(len(index)):
+            start = round(float(index.video_start_s[camera][episode]) * spec.fps)
+            path = index.video_path(episode, camera)
+            needed[path] = max(needed.get(path, 0), start + int(index.length[episode]))
+        for path, frames in needed.items():
+            yield camera, path, frames
+
+
+def _video_counts(index: EpisodeIndex, spec: DatasetSpec) -> str:
+    files = 0
+    for camera, path, needed in _video_files(index, spec):
+        frames, size = count_frames(path)
+        if frames < needed:
+            raise DataError(f"{path}: {frames} frames for {needed} rows")
+        if size != spec.cameras[camera]:
+            raise DataError(f"{path}: {size} pixels; the spec says {spec.cameras[camera]}")
+        files += 1
+    return f"{files} file(s), as many frames as rows"
+
+
+def _video_ends(index: EpisodeIndex, spec: DatasetSpec) -> str:
+    for camera in spec.cameras:
+        for episode in range(len(index)):
+            start = round(float(index.video_start_s[camera][episode]) * spec.fps)
+            path = index.video_path(episode, camera)
+            for frame in (start, start + int(index.length[episode]) - 1):
+                for _ in decode_video(path, frame, frame + 1, spec.fps):
+                    pass
+    return f"first and last frame of {len(index)} episodes decode"

@@ -1,0 +1,213 @@
+"""Damaged datasets: validate finds it, repair keeps the rest, nothing ends in a traceback.
+
+``EISP_MUTATIONS=2000`` in the environment runs the mutations in that number.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+from storage_samples import assert_same, random_episode, spec_of
+
+from eisp_data.errors import EispError
+from eisp_data.storage.cache import load_arrays
+from eisp_data.storage.lerobot import DatasetWriter, read_episodes
+from eisp_data.storage.repair import repair
+from eisp_data.storage.validate import validate
+
+MUTATIONS = int(os.environ.get("EISP_MUTATIONS", "60"))
+
+
+def failed(root):
+    return {check.name for check in validate(root) if not check.passed}
+
+
+def test_a_sound_dataset_passes_every_check(make_dataset):
+    for cameras in (False, True):
+        root, _ = make_dataset(f"cameras-{cameras}", cameras=cameras)
+        assert failed(root) == set()
+
+
+def test_repairing_a_sound_dataset_changes_no_episode(make_dataset, tmp_path):
+    root, episodes = make_dataset(cameras=True)
+    report = repair(root)
+    assert (report.episodes, report.lost) == (5, [])
+    for ours, theirs in zip(episodes, read_episodes(report.copy, images=True), strict=True):
+        assert_same(ours, theirs)
+    assert failed(report.copy) == set()
+
+
+class TestEachKindOfDamage:
+    def test_counts_that_disagree(self, make_dataset):
+        root, _ = make_dataset()
+        info = json.loads((root / "meta/info.json").read_text())
+        info.update(total_episodes=4, total_frames=30)
+        (root / "meta/info.json").write_text(json.dumps(info))
+        assert failed(root) == {"episode count", "frame count"}
+        assert failed(repair(root).copy) == set()
+
+    def test_a_missing_footer_costs_the_episodes_of_its_file(self, make_dataset):
+        root, episodes = make_dataset()
+        path = root / "data/chunk-000/file-001.parquet"
+        path.write_bytes(path.read_bytes()[:-100])
+        assert "rows" in failed(root)
+        report = repair(root)
+        assert report.episodes == 2 and any("file-001.parquet" in line for line in report.lost)
+        for ours, theirs in zip(episodes[:2], read_episodes(report.copy), strict=True):
+            assert_same(ours, theirs)
+
+    def test_a_half_written_last_episode(self, make_dataset):
+        root, episodes = make_dataset()
+        path = root / "data/chunk-000/file-001.parquet"
+        table = pq.read_table(path)
+        pq.write_table(table.slice(0, table.num_rows - 4), path)
+        assert "rows" in failed(root)
+        report = repair(root)
+        assert report.lost == [f"{path}: episode 4: 6 of 10 rows are left"]
+        for ours, theirs in zip(episodes[:4], read_episodes(report.copy), strict=True):
+            assert_same(ours, theirs)
+
+    def test_all_of_meta_gone(self, make_dataset):
+        root, episodes = make_dataset(cameras=True)
+        shutil.rmtree(root / "meta")
+        report = repair(root)
+        assert report.lost == []
+        for ours, theirs in zip(episodes, read_episodes(report.copy, images=True), strict=True):
+            assert_same(ours, theirs)
+
+    def test_a_video_that_ends_early(self, make_dataset):
+        root, _ = make_dataset(cameras=True)
+        path = root / "videos/observation.images.top/chunk-000/file-001.mp4"
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+        assert {"video frames", "video ends"} <= failed(root)
+        report = repair(root)
+        assert report.episodes == 2 and len(report.lost) == 3
+        assert failed(report.copy) == set()
+
+    def test_bits_of_one_row_group_cost_one_episode(self, make_dataset):
+        root, _ = make_dataset()
+        path = root / "data/chunk-000/file-001.parquet"
+        column = pq.read_metadata(path).row_group(1).column(0)
+        data = bytearray(path.read_bytes())
+        offset = column.data_page_offset
+        data[offset : offset + 20] = bytes(20)
+        path.write_bytes(data)
+        report = repair(root)
+        assert report.episodes == 4 and len(report.lost) == 1
+
+    def test_nan_costs_its_episode(self, make_dataset):
+        root, _ = make_dataset()
+        path = root / "data/chunk-000/file-000.parquet"
+        table = pq.read_table(path)
+        reward = table["next.reward"].to_numpy().copy()
+        reward[0] = np.nan
+        number = table.column_names.index("next.reward")
+        pq.write_table(table.set_column(number, "next.reward", [reward]), path)
+        assert "rows" in failed(root)
+        report = repair(root)
+        assert report.episodes == 4 and "next.reward is not finite" in report.lost[0]
+
+
+def test_in_place_keeps_the_original_under_another_name(make_dataset):
+    root, _ = make_dataset()
+    (root / "meta/info.json").unlink()
+    before = {p.relative_to(root): p.read_bytes() for p in root.rglob("*") if p.is_file()}
+    report = repair(root, in_place=True)
+    assert failed(root) == set()
+    damaged = report.original
+    assert damaged == root.with_name("dataset.damaged")
+    after = {p.relative_to(damaged): p.read_bytes() for p in damaged.rglob("*") if p.is_file()}
+    assert after == before
+
+
+def test_a_stuck_channel_and_a_late_action_are_pointed_out(tmp_path):
+    spec = spec_of(action_dim=2)
+    rng = np.random.default_rng(0)
+    episodes = []
+    for seed in range(4):
+        drawn = random_episode(spec, 60, seed)
+        action = rng.uniform(-1, 1, (60, 2)).astype(np.float32)
+        observation = drawn.observation.copy()
+        # The action moves the first component, 5 steps late.
+        moves = np.concatenate([np.zeros((5, 2)), action[:-5]])[:, 0]
+        observation[1:, 0] = observation[0, 0] + np.cumsum(moves)
+        if seed == 2:
+            observation[:, 3] = 0.5
+        changed = {"observation": observation, "action": action}
+        episodes.append(type(drawn)(**{**vars(drawn), **changed}))
+    with DatasetWriter(tmp_path / "d", spec, {}) as writer:
+        writer.write(episodes)
+    warned = {check.name: check.detail for check in validate(tmp_path / "d") if check.warning}
+    assert warned["stuck channels"] == "observation.state[3] in episode 2"
+    assert warned["action lag"].startswith("5 step(s), 200 ms")
+
+
+def mutate(data: bytes, rng: np.random.Generator) -> bytes:
+    """Return a file cut short, emptied, with bits flipped, a stretch zeroed or doubled."""
+    if not data:
+        return data
+    kind = rng.integers(6)
+    start = int(rng.integers(len(data)))
+    length = int(min(len(data) - start, 1 + rng.integers(64)))
+    if kind == 0:
+        return data[:start]
+    if kind == 1:
+        return b""
+    if kind == 2:
+        return data[:start] + bytes(length) + data[start + length :]
+    if kind == 3:
+        return data[: start + length] + data[start:]
+    if kind == 4:  # a number in text, a version, becomes another
+        return data.replace(b"3", b"9", 1) if b"v3.0" in data else data[start:]
+    changed = bytearray(data)
+    for place in rng.integers(len(data), size=1 + rng.integers(8)):
+        changed[place] ^= 1 << rng.integers(8)
+    return bytes(changed)
+
+
+def test_mutated_files_give_a_line_or_a_right_result(make_dataset, tmp_path):
+    root, episodes = make_dataset(cameras=True)
+    by_seed = {episode.seed: episode for episode in episodes}
+    files = sorted(p.relative_to(root) for p in root.rglob("*") if p.is_file())
+    outcomes: Counter[str] = Counter()
+    for number in range(MUTATIONS):
+        rng = np.random.default_rng(number)
+        copy, fixed = tmp_path / "mutated", tmp_path / "fixed"
+        for folder in (copy, fixed):
+            shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(root, copy)
+        chosen = copy / files[int(rng.integers(len(files)))]
+        chosen.write_bytes(mutate(chosen.read_bytes(), rng))
+        outcomes[_look(copy, fixed, by_seed)] += 1
+    assert sum(outcomes.values()) == MUTATIONS
+    print(dict(outcomes))
+
+
+def _look(root: Path, fixed: Path, by_seed: dict) -> str:
+    """Validate, read, cache and repair; whatever comes out must be an original episode or a line.
+
+    Only what no checksum covers may differ: a flipped bit in the rows themselves.
+    """
+    words = []
+    for name, action in (
+        ("validate", lambda: "bad" if failed(root) else "good"),
+        ("read", lambda: str(sum(1 for _ in read_episodes(root, images=True)))),
+        ("cache", lambda: str(load_arrays(root).num_episodes)),
+        ("repair", lambda: str(repair(root, fixed).episodes)),
+    ):
+        try:
+            words.append(f"{name} {action()}")
+        except EispError as error:
+            assert "\n" not in str(error).strip(), (name, str(error))
+            words.append(f"{name} refused")
+    if fixed.exists():
+        for episode in read_episodes(fixed):
+            assert len(episode) == len(by_seed[episode.seed])
+        assert failed(fixed) == set()
+    return ", ".join(words)
