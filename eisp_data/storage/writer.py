@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -140,7 +141,8 @@ class DatasetWriter:
         self._closed = True
         try:
             if self.num_episodes:
-                compact_episodes(self.root)
+                with suppress(OSError):  # only tidying: on a full disk the dataset is whole without
+                    compact_episodes(self.root)
             elif self._started_empty:
                 self._remove_empty()
         finally:

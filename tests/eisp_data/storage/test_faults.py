@@ -1,0 +1,203 @@
+"""SIGKILL at random moments, and a disk that is full: only the batch in hand is lost.
+
+``EISP_KILLS=200`` in the environment kills that often.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from storage_samples import assert_same, random_episode, spec_of
+
+from eisp_data.errors import DataError
+from eisp_data.storage.lerobot import DatasetWriter, read_episodes
+from eisp_data.storage.repair import repair
+from eisp_data.storage.validate import validate
+
+KILLS = int(os.environ.get("EISP_KILLS", "8"))
+BATCH = 3
+
+# Imports once and forks a writer for each line it reads, so that a kill costs no start-up.
+NURSERY = """
+import os, sys
+sys.path.insert(0, sys.argv[1])
+import av, pandas
+from storage_samples import random_episode, spec_of
+from eisp_data.storage.lerobot import DatasetWriter
+spec = spec_of(cameras=True)
+
+def collect(root):
+    with DatasetWriter(root, spec, {"kind": "kill"}, resume=True) as writer:
+        print("open", writer.num_episodes, flush=True)
+        while True:
+            first = writer.num_episodes
+            writer.write([random_episode(spec, 6, first + i) for i in range(3)])
+            print("wrote", writer.num_episodes, flush=True)
+
+for line in sys.stdin:
+    pid = os.fork()
+    if not pid:
+        collect(line.strip())
+    print("pid", pid, flush=True)
+    os.waitpid(pid, 0)
+    print("dead", flush=True)
+"""
+
+
+class Nursery:
+    """Starts writers and kills them."""
+
+    def __init__(self) -> None:
+        here = str(Path(__file__).parent)
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", NURSERY, here],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def kill_one(self, root: Path, batches: int, delay_s: float) -> int:
+        """Start a writer, kill it some time after so many batches; return what it promised."""
+        assert self._process.stdin is not None and self._process.stdout is not None
+        self._process.stdin.write(f"{root}\n")
+        self._process.stdin.flush()
+        pid = promised = wrote = 0
+        opened = False
+        while not pid or not opened or wrote < batches:
+            word, number = self._process.stdout.readline().split()
+            if word == "pid":
+                pid = int(number)
+            else:
+                opened, promised = True, int(number)
+                wrote += word == "wrote"
+        time.sleep(delay_s)
+        os.kill(pid, signal.SIGKILL)
+        while (line := self._process.stdout.readline().split()) != ["dead"]:
+            promised = int(line[1])
+        return promised
+
+    def close(self) -> None:
+        """End the nursery."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        self._process.wait()
+
+
+def check_upstream(root: Path, episodes: int, frames: int) -> None:
+    """Open a dataset with LeRobot and read its first and last frame, image included."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    dataset = LeRobotDataset("test/killed", root=root)
+    assert dataset.num_episodes == episodes and len(dataset) == frames
+    spec = spec_of(cameras=True)
+    for step in (0, frames - 1):
+        item = dataset[step]
+        episode = random_episode(spec, 6, step // 6)
+        assert np.array_equal(item["action"], episode.action[step % 6])
+        image = item["observation.images.top"].numpy().transpose(1, 2, 0) * 255
+        assert np.abs(image - episode.images["top"][step % 6]).mean() < 4
+
+
+def test_a_kill_at_any_moment_loses_at_most_the_batch_in_hand(tmp_path, monkeypatch):
+    """The process is killed at a random moment, opened by LeRobot, validated, and resumed."""
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    monkeypatch.setattr("datasets.config.HF_DATASETS_CACHE", str(tmp_path / "hf"))
+    spec = spec_of(cameras=True)
+    draw = random.Random(1)
+    nursery = Nursery()
+    root, states = tmp_path / "killed", Counter[str]()
+    for kill in range(KILLS):
+        if kill % 10 == 0:
+            root = tmp_path / f"killed-{kill}"
+        promised = nursery.kill_one(root, draw.randrange(3), draw.uniform(0, 0.06))
+        kept = list(read_episodes(root, images=True)) if (root / "data").exists() else []
+        # What the writer said is there; at most one more batch can be, whole.
+        assert len(kept) in (promised, promised + BATCH)
+        for number, episode in enumerate(kept):
+            assert_same(random_episode(spec, 6, number), episode)
+        if not kept:
+            states["killed before the first batch"] += 1
+            continue
+        bad = [check.name for check in validate(root) if not check.passed]
+        assert set(bad) <= {"episode count", "frame count", "no stray files", "statistics"}, bad
+        states[", ".join(bad) or "nothing to mend"] += 1
+        stated = json.loads((root / "meta/info.json").read_text())
+        if stated["total_episodes"]:
+            check_upstream(root, stated["total_episodes"], stated["total_frames"])
+        if kill % 5 == 0:
+            copy = repair(root, tmp_path / f"repaired-{kill}").copy
+            assert all(check.passed for check in validate(copy))
+            for ours, theirs in zip(kept, read_episodes(copy), strict=True):
+                assert_same(ours, theirs)
+    nursery.close()
+    print(dict(states))
+    DatasetWriter(root, spec, {"kind": "kill"}, resume=True).close()
+    if (root / "data").exists():
+        assert all(check.passed for check in validate(root))
+
+
+def _mount_tmpfs(folder: Path, size: str) -> bool:
+    folder.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
+    return subprocess.run(command, capture_output=True).returncode == 0
+
+
+def _fill_up(root: Path) -> tuple[int, str]:
+    """Write batches until the disk is full; return how many episodes were promised."""
+    spec = spec_of(cameras=True)
+    with DatasetWriter(root, spec, {}) as writer:
+        for first in range(0, 3000, BATCH):
+            try:
+                writer.write([random_episode(spec, 6, first + i) for i in range(BATCH)])
+            except DataError as error:
+                return writer.num_episodes, str(error)
+    raise AssertionError("the disk was never full")
+
+
+def _check_full(root: Path, promised: int, message: str) -> None:
+    assert f"the {promised} episodes written before are safe" in message and "\n" not in message
+    kept = list(read_episodes(root, images=True))
+    assert len(kept) == promised > 0
+    for number, episode in enumerate(kept):
+        assert_same(random_episode(spec_of(cameras=True), 6, number), episode)
+    assert all(check.passed for check in validate(root))
+
+
+def test_a_full_disk_is_one_clear_line_and_the_finished_part_is_whole(tmp_path):
+    folder = tmp_path / "small"
+    if not _mount_tmpfs(folder, "700k"):
+        pytest.skip("mounting a tmpfs needs privileges that this process has not")
+    try:
+        promised, message = _fill_up(folder / "dataset")
+        assert "No space left on device" in message
+        _check_full(folder / "dataset", promised, message)
+    finally:
+        subprocess.run(["umount", str(folder)], check=True)
+
+
+def test_a_file_that_may_not_grow_is_one_clear_line(tmp_path):
+    """The same without privileges: a limit on the size of files, as a quota sets it."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    spec = spec_of()
+    with DatasetWriter(tmp_path / "d", spec, {}) as writer:
+        writer.write([random_episode(spec, 6, 0)])
+        resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, limits[1]))
+        try:
+            with pytest.raises(DataError, match="the 1 episodes written before are safe"):
+                writer.write([random_episode(spec, 900, 1)])
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        writer.write([random_episode(spec, 6, 1)])
+    assert all(check.passed for check in validate(tmp_path / "d"))
+    assert [episode.seed for episode in read_episodes(tmp_path / "d")] == [0, 1]
