@@ -2,35 +2,49 @@
 
 from __future__ import annotations
 
+import inspect
+import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
-from typing import Any, NoReturn
+from typing import Any, NoReturn, get_type_hints
 
-import tyro
-
+from eisp_data.cli.parse import parse
 from eisp_data.errors import EispError
 
 USER_ERROR = 2
 
 
-def run(function: Callable[..., Any], args: Sequence[str] | None = None, prog: str = "") -> Any:
+def run(
+    function: Callable[[Any], Any],
+    args: Sequence[str] | None = None,
+    prog: str | None = None,
+    config_file: bool = False,
+) -> Any:
     """Parse ``args`` (the command line, if left out) into ``function``'s options and call it.
 
     Args:
-        function: takes one dataclass of options, or keyword options of its own.
+        function: takes one dataclass of options, whose fields become the flags; its docstring is
+            the command's help.
         args: words of the command line.
         prog: name of the command in its help.
+        config_file: offer ``--config FILE.yaml``, which starts from a saved configuration.
 
     Returns:
         What ``function`` returns.
 
     An ``EispError`` is printed as one line on stderr, and the process exits with status 2.
     """
+    hints = get_type_hints(function, include_extras=True)
+    hints.pop("return", None)
+    (kind,) = hints.values()
     try:
-        return tyro.cli(function, args=args, prog=prog or None)
+        return function(parse(kind, args, prog, inspect.getdoc(function), config_file))
     except EispError as error:
         fail(str(error))
+    except BrokenPipeError:  # whoever read the output, ``head`` for example, has had enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(128 + 13)
     except OSError as error:  # a folder that cannot be read, a full disk
         fail(f"{error.filename or prog}: {error.strerror or error}")
     except KeyboardInterrupt:
