@@ -6,6 +6,7 @@ from eisp_data.errors import DataError
 from eisp_data.storage.mcap import decode
 from eisp_data.storage.mcap.mapping import Mapping, StreamMap
 from eisp_data.storage.mcap.reader import McapLog
+from eisp_data.storage.mcap.sources import STATIC
 from eisp_data.storage.mcap.writer import ROLE_KEY, camera_name
 
 _LOOKED_AT = 200
@@ -67,6 +68,8 @@ def _by_type(log: McapLog, topic: str) -> list[StreamMap]:
     if name in ("Vector", "Float64MultiArray", "Float32MultiArray", "TwistStamped"):
         last = topic.split("/")[-1]
         return [StreamMap(topic=topic, to=to) for to, words in _WORDS.items() if last in words]
+    if topic.endswith(STATIC):
+        return []  # How a camera is mounted is no object to be moved.
     streams = []
     for frame in _frames(log, topic):
         streams.append(StreamMap(topic=topic, frame=frame, to=_WORLD))

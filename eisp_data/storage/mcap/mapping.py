@@ -68,6 +68,9 @@ class StreamMap:
     """Of transforms: the child frame."""
     parent: str = ""
     """Of transforms: the parent frame, if a child appears under several."""
+    via: tuple[str, ...] = ()
+    """Of transforms: the frames between parent and frame, for instance the camera's; transforms
+    on ``<topic>_static`` count too."""
     low: tuple[float, ...] = ()
     """Of actions: what becomes -1, one value for each component."""
     high: tuple[float, ...] = ()
@@ -86,6 +89,8 @@ class StreamMap:
                 f"{self.topic}: to: {self.to!r}; choose one of {', '.join(ROLES)}, "
                 f"{IMAGE}<camera>, {EXTRA}<column>"
             )
+        if self.via and not (self.parent and self.frame):
+            raise ConfigError(f"{self.topic}: via needs both parent and frame")
         if self.rule not in ("", *RULES):
             raise ConfigError(
                 f"{self.topic}: rule: {self.rule!r}; choose one of {', '.join(RULES)}"
@@ -185,7 +190,7 @@ def load_mapping(path: str | Path) -> Mapping:
 
 def _stream(values: Any, number: int) -> StreamMap:
     values = _checked(values, StreamMap, f"stream {number}")
-    lists: dict[str, type] = {"fields": str, "joints": str, "low": float, "high": float}
+    lists: dict[str, type] = {"fields": str, "joints": str, "via": str, "low": float, "high": float}
     lists["size"] = int
     for key in ("topic", "to"):
         if key not in values:

@@ -8,9 +8,13 @@ import numpy as np
 
 from eisp_data.errors import DataError
 from eisp_data.storage.mcap import decode, pixels
+from eisp_data.storage.mcap.chain import chain, edges
 from eisp_data.storage.mcap.collect import LAST_TIME_NS, Clock, Collector, Source, time_of
-from eisp_data.storage.mcap.mapping import Mapping
+from eisp_data.storage.mcap.mapping import Mapping, StreamMap
 from eisp_data.storage.mcap.reader import Entry, McapLog
+
+STATIC = "_static"
+"""What ROS appends to the topic of transforms for those that never change."""
 
 
 @dataclass
@@ -27,28 +31,39 @@ def load(log: McapLog, mapping: Mapping, clock: Clock) -> Recording:
 
     Raises DataError if a topic is missing, empty, or cannot be decoded.
     """
-    topics = {stream.topic for stream in mapping.streams}
-    for topic in sorted(topics):
+    for topic in sorted({stream.topic for stream in mapping.streams}):
         if topic not in log.topics and _needed(mapping, topic):
             known = ", ".join(sorted(log.topics)) or "none"
             raise DataError(f"{log.path}: no channel {topic}; it has {known}")
-    collectors = [Collector(s) for s in mapping.streams if s.to != "events"]
-    by_topic: dict[str, list[Collector]] = {topic: [] for topic in topics}
-    for collector in collectors:
-        by_topic[collector.stream.topic].append(collector)
+    streams = [stream for stream in mapping.streams if stream.to != "events"]
+    collectors = [[Collector(edge) for edge in edges(stream)] for stream in streams]
+    by_topic: dict[str, list[Collector]] = {}
+    for parts in collectors:
+        for collector in parts:
+            by_topic.setdefault(collector.stream.topic, []).append(collector)
+            if len(parts) > 1:  # Fixed transforms are on a topic of their own.
+                static = collector.stream.topic + STATIC
+                by_topic.setdefault(static, []).append(collector)
     event_topics = {s.topic for s in mapping.streams if s.to == "events"}
     decoder, events = decode.Decoder(), []
-    for entry in log.messages(topics, in_order=False):
+    for entry in log.messages({*by_topic, *event_topics}, in_order=False):
         decoded = decoder.decode(entry.channel, log.schema_of(entry.channel), entry.message.data)
         if entry.topic in event_topics and isinstance(decoded, decode.Event):
             events.append(_timed(decoded, entry, clock))
-        for collector in by_topic[entry.topic]:
+        for collector in by_topic.get(entry.topic, ()):
             collector.add(entry, decoded, clock)
     events.sort(key=lambda event: event.time_ns or 0)
     try:
-        return Recording([collector.source() for collector in collectors], events)
+        return Recording(
+            [_source(s, parts) for s, parts in zip(streams, collectors, strict=True)], events
+        )
     except DataError as error:
         raise DataError(f"{log.path}: {error}") from None
+
+
+def _source(stream: StreamMap, parts: list[Collector]) -> Source:
+    found = [collector.source() for collector in parts]
+    return chain(stream, found) if stream.via else found[0]
 
 
 def _needed(mapping: Mapping, topic: str) -> bool:

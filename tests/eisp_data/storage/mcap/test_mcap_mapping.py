@@ -44,6 +44,7 @@ def test_a_mapping_survives_being_written_and_read(tmp_path: Path) -> None:
         ("size: [48, 64]", "size: [48, 64], rule: interpolate", "cannot be interpolated"),
         ("high: [1, 2.5]", "high: [1]", "pair up"),
         ("high: [1, 2.5]", "high: [1, x]", "is not of the right kind"),
+        ("frame: block", "frame: block, via: [camera]", "via needs both parent and frame"),
         ("frame: block", "frame: [block]", "is not of the right kind"),
         ("fields: [position], rule", "fields: [place], rule", "choose from"),
         ("max_age_s: 2", "max_age_s: -2", "0 or above"),

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from eisp_data.storage.mcap.chain import compose, multiply, rotate
 from eisp_data.storage.mcap.resample import gaps, make_series, pick, resample, slerp
 
 MS = 1_000_000
@@ -99,3 +100,29 @@ def test_a_camera_that_stops_leaves_a_gap_up_to_the_end() -> None:
     series = series_at([0, 50, 100, 150])
     assert gaps(series, 0, 1000 * MS, 200 * MS) == [(150 * MS, 1000 * MS)]
     assert gaps(series, 0, 200 * MS, 200 * MS) == []
+
+
+angles = st.floats(-3, 3)
+
+
+@given(st.lists(st.floats(-1, 1), min_size=7, max_size=7), st.floats(-5, 5))
+def test_a_composed_pose_maps_a_point_as_the_two_poses_do_in_turn(
+    numbers: list[float], x: float
+) -> None:
+    quaternion = np.array(numbers[3:]) + np.array([2.0, 0, 0, 0])
+    outer = np.append(numbers[:3], quaternion / np.linalg.norm(quaternion))[None]
+    inner = np.append([x, 1.0, 2.0], about_z(x))[None]
+    point = np.array([[0.3, -0.2, 0.1]])
+
+    def apply(pose: np.ndarray, to: np.ndarray) -> np.ndarray:
+        return pose[:, :3] + rotate(pose[:, 3:], to)
+
+    np.testing.assert_allclose(
+        apply(compose(outer, inner), point), apply(outer, apply(inner, point)), atol=1e-12
+    )
+
+
+@given(angles, angles)
+def test_turns_about_one_axis_add_up(a: float, b: float) -> None:
+    product = multiply(about_z(a)[None], about_z(b)[None])[0]
+    np.testing.assert_allclose(product, about_z(a + b), atol=1e-12)

@@ -111,6 +111,9 @@ def write_bag(path: Path, episodes: int = 2, steps: int = 25, compress: bool = F
     Messages are recorded 7 ms after the time in their header, so the two clocks can be told apart;
     commands carry no header.
     """
+    quarter = turn(np.sqrt(0.5), np.sqrt(0.5))
+    place = T["geometry_msgs/msg/Transform"](xyz("Vector3", 1.0, 0.0, 0.5), quarter)
+    mount = T["geometry_msgs/msg/TransformStamped"](header(0), "camera", place)
     writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
     if compress:
         writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
@@ -123,6 +126,8 @@ def write_bag(path: Path, episodes: int = 2, steps: int = 25, compress: bool = F
 
     text = T["std_msgs/msg/String"]
     with writer:
+        fixed = T["tf2_msgs/msg/TFMessage"]([mount])
+        publish("/tf_static", "tf2_msgs/msg/TFMessage", fixed, START_NS - 10**9)
         for episode in range(episodes):
             start = START_NS + episode * 5_000_000_000
             publish("/episode", "std_msgs/msg/String", text("episode_start operator=bo"), start)
@@ -221,6 +226,23 @@ def test_a_pose_stamped_and_a_twist_are_decoded() -> None:
     assert got[0].poses[0].position.tolist() == [1, 2, 3]
     assert got[0].poses[0].orientation.tolist() == pytest.approx([0.6, 0, 0, 0.8])
     assert got[1].values.tolist() == [1, 2, 3, 4, 5, 6]
+
+
+def test_a_marker_seen_by_a_fixed_camera_is_placed_in_the_frame_of_the_base(
+    bag: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "m.yaml").write_text(
+        "streams:\n"
+        "  - {topic: /joint_states, to: observation.state}\n"
+        "  - {topic: /tf, parent: base, via: [camera], frame: marker, fields: [position],\n"
+        "     to: observation.achieved_goal}\n"
+        "  - {topic: /commands, to: action}\n"
+    )
+    config = ConvertConfig(inputs=(bag,), to=tmp_path / "d", mapping=tmp_path / "m.yaml")
+    convert(config)
+    episode = next(read_episodes(tmp_path / "d"))
+    # (9, 9, 9) before a camera at (1, 0, 0.5) that is turned by 90 degrees about z.
+    np.testing.assert_allclose(episode.achieved_goal, [[1 - 9.0, 9.0, 9.5]] * 151, atol=1e-5)
 
 
 def test_a_compressed_bag_converts_to_the_same_episodes(
