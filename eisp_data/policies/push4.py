@@ -55,9 +55,9 @@ def _arrange(view: View, aim: Aim, targets: np.ndarray, most: int) -> Iterator[K
             return
         touched.add(push.block)
         push = replace(push, target=aim.at(np.append(push.target, 0.0))[:2])
-        yield from _approach(view, push)
+        yield from approach(view, push)
         if view.gripper[2] < _LOWERED_M:
-            yield from _follow(view, push)
+            yield from follow(view, push)
 
 
 def _own_places(view: View, aim: Aim) -> np.ndarray | None:
@@ -70,7 +70,7 @@ def _own_places(view: View, aim: Aim) -> np.ndarray | None:
     return None
 
 
-def _approach(view: View, push: Push) -> Iterator[Keyframe]:
+def approach(view: View, push: Push) -> Iterator[Keyframe]:
     """Bring the fingers down behind the block, along the table if nothing is in between."""
     if not (
         view.gripper[2] < _LOWERED_M
@@ -82,7 +82,7 @@ def _approach(view: View, push: Push) -> Iterator[Keyframe]:
     yield Keyframe(np.append(push.stand, _LOW_M), CLOSED, tolerance_m=0.008)
 
 
-def _follow(view: View, push: Push) -> Iterator[Keyframe]:
+def follow(view: View, push: Push, fastest_m: float = _FASTEST_M) -> Iterator[Keyframe]:
     """Push, aiming anew at every step, until the block is there or slips off the fingers."""
     for step in range(_PUSH_STEPS):
         block = view.blocks[push.block, :2]
@@ -90,7 +90,7 @@ def _follow(view: View, push: Push) -> Iterator[Keyframe]:
         if left @ push.normal < _ARRIVED_M or not is_behind(view.gripper[:2], block, push.normal):
             break
         way = float(np.linalg.norm(left))
-        length = min(_START_M * (step + 1), _FASTEST_M, _braking(way))
+        length = min(_START_M * (step + 1), fastest_m, _braking(way))
         ahead = view.gripper[:2] + left / way * max(length, _SLOWEST_M)
         yield Keyframe(np.append(ahead, _LOW_M), CLOSED, tolerance_m=0.0, most_steps=1)
     back = view.gripper[:2] - _BACK_M * push.normal

@@ -68,6 +68,26 @@ def choose_push(blocks: np.ndarray, targets: np.ndarray, misplaced: np.ndarray) 
     return next((push for push in pushes if push), None) or _forced(blocks, todo[0], targets)
 
 
+def possible_pushes(block: int, start: np.ndarray, end: np.ndarray) -> list[Push | None]:
+    """Return the push from each of two faces, best first, were the block alone on the table.
+
+    Args:
+        block: its number.
+        start: (2,) m, the centre of the block.
+        end: (2,) m.
+
+    Returns:
+        None for a face that the pusher cannot get behind, or that it would slip along.
+    """
+    pushes: list[Push | None] = []
+    for normal in _normals(end - start):
+        stand = _stand(start, end, normal)
+        inside = (stand >= WORKSPACE_LOW_M[:2]).all() and (stand <= WORKSPACE_HIGH_M[:2]).all()
+        possible = inside and _slope(end - start, normal) <= _STEEPEST
+        pushes.append(Push(block, end, normal, stand) if possible else None)
+    return pushes
+
+
 def way_for_pusher(start: np.ndarray, end: np.ndarray, blocks: np.ndarray) -> bool:
     """Return whether the lowered fingers can go straight from here to there."""
     half = np.minimum(BESIDE_M + _MARGIN_M, _apart(start, blocks) - 1e-3)
@@ -156,12 +176,10 @@ def _obstacles(start: np.ndarray, end: np.ndarray, places: np.ndarray, block: in
     half = np.minimum(WAY_HALF_WIDTH_M, _apart(start, places) - 1e-3)
     in_way = on_the_way(start, end, places, half[:, None]) & others
     result = np.ones((2, len(places)), bool)
-    for face, normal in enumerate(_normals(end - start)):
-        stand = _stand(start, end, normal)
-        inside = (stand >= WORKSPACE_LOW_M[:2]).all() and (stand <= WORKSPACE_HIGH_M[:2]).all()
-        if inside and _slope(end - start, normal) <= _STEEPEST:
-            touching = stand + end - start
-            hit = on_the_way(stand, touching, places, BESIDE_M + _MARGIN_M)
+    for face, push in enumerate(possible_pushes(block, start, end)):
+        if push is not None:
+            touching = push.stand + end - start
+            hit = on_the_way(push.stand, touching, places, BESIDE_M + _MARGIN_M)
             result[face] = in_way | (hit & others)
     return result
 

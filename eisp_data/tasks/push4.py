@@ -5,10 +5,10 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from eisp_data.sim.scene import BLOCK_SIZE_M, SUBSTEPS, TIMESTEP_S, table_model
+from eisp_data.sim.scene import BLOCK_SIZE_M, table_model
 from eisp_data.tasks import paper
-from eisp_data.tasks.base import Task
 from eisp_data.tasks.placement import scatter
+from eisp_data.tasks.steady import SteadyTask
 from eisp_data.tasks.ways import on_the_way
 
 PUSH_LOW_M = (0.235, -0.145)
@@ -23,7 +23,7 @@ _TANGLED_SHARE = 0.5
 """Share of the episodes in which a block may lie in another's way, or on its goal."""
 
 
-class Push4(Task):
+class Push4(SteadyTask):
     """Each block belongs at its own place; some have to be pushed in a certain order.
 
     There is always an order in which straight pushes do it. In some of the episodes any order
@@ -40,27 +40,6 @@ class Push4(Task):
     def model(self) -> mujoco.MjModel:
         """The table with four blocks."""
         return table_model(self.blocks)
-
-    def control(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
-        """Turn (N, 4) actions into (N, SUBSTEPS, 5) servo targets that move at a constant speed.
-
-        A servo target that jumps makes the fingers lunge and kick a block out of reach. A target
-        that leads by the servo's own lag and then moves on keeps the fingers at one speed.
-        """
-        target = super().control(state, action)
-        start = self.qpos(state)[:, :3]
-        passed = np.arange(1, SUBSTEPS + 1)[:, None] / SUBSTEPS
-        path = np.repeat(target[:, None], SUBSTEPS, axis=1)
-        path[..., :3] = start[:, None] + (target[:, None, :3] - start[:, None]) * (
-            passed + self._servo_lag
-        )
-        return path
-
-    @property
-    def _servo_lag(self) -> float:
-        """Damping by stiffness of the gripper's servo, in control periods."""
-        _, stiffness, damping = -self.model.actuator_biasprm[0, :3]
-        return float(damping / stiffness / (TIMESTEP_S * SUBSTEPS))
 
     def reset(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Draw four block positions, four targets and the gripper's position above them."""

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from eisp_data.errors import ConfigError
 from eisp_data.tasks.base import Task
+from eisp_data.tasks.open_drawer import OpenDrawer
 from eisp_data.tasks.push4 import Push4
 from eisp_data.tasks.stack import Stack
 
-TASKS: dict[str, Task] = {task.name: task for task in (Stack(), Push4())}
+TASKS: dict[str, Task] = {task.name: task for task in (Stack(), Push4(), OpenDrawer())}
 
 
 def get_task(name: str) -> Task:
