@@ -1,19 +1,35 @@
-"""Scripted demonstrations: one script in each of many worlds, one Episode for each seed."""
+"""Episodes by the thousand: one policy in each of many worlds, one Episode for each seed."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
+from typing import Protocol
 
 import numpy as np
 
-from eisp_data.episode import Episode
+from eisp_data.episode import Episode, Scalar
 from eisp_data.policies.script import Noise, Script, ScriptedPolicy
+from eisp_data.sim.gym_worlds import GymWorlds
 from eisp_data.sim.worlds import Worlds
-from eisp_data.tasks.base import Task, compute_reward, is_success
+from eisp_data.tasks.base import Task
 
 _TAIL_STEPS = 5
 """An episode goes on this long after its script has ended, for what is falling to come to rest."""
+
+
+class Actor(Protocol):
+    """What acts in a batch of worlds while they are recorded."""
+
+    def begin(self, world: int, seed: int) -> None:
+        """Start anew in one world, which has just been reset with this seed."""
+
+    def act(self) -> np.ndarray:
+        """Return (N, A) actions in [-1, 1] for the worlds as they are now."""
+
+    @property
+    def finished(self) -> np.ndarray:
+        """(N,) bool: there is nothing left to do."""
 
 
 def collect(
@@ -25,72 +41,141 @@ def collect(
     worlds: int = 64,
     threads: int | None = None,
 ) -> Iterator[Episode]:
-    """Yield one Episode for each seed, in the order of the seeds.
+    """Yield one scripted Episode for each seed, in the order of the seeds.
 
     An episode depends on its seed alone, not on how many worlds run beside it or how many threads.
     """
-    worlds = min(worlds, len(seeds))
-    batch = Worlds(task, worlds, threads)
-    policy = ScriptedPolicy(task, script, noise, worlds)
-    recorders: list[_Recorder | None] = [None] * worlds
+    batch = Worlds(task, min(worlds, len(seeds)), threads)
+    actor = _ScriptActor(batch, ScriptedPolicy(task, script, noise, batch.count))
+    return record(batch, actor, seeds, {"policy": "scripted", **asdict(noise)})
+
+
+def explore(worlds: Worlds | GymWorlds, seeds: Sequence[int]) -> Iterator[Episode]:
+    """Yield one Episode of random actions for each seed, in the order of the seeds."""
+    return record(worlds, _RandomActor(worlds), seeds, {"policy": "random"})
+
+
+def record(
+    worlds: Worlds | GymWorlds, actor: Actor, seeds: Sequence[int], info: Mapping[str, Scalar]
+) -> Iterator[Episode]:
+    """Yield what the actor does, one Episode for each seed, in the order of the seeds.
+
+    Args:
+        worlds: a batch; its worlds take the next seed as soon as they are done with one.
+        actor: acts in them.
+        seeds: of the resets.
+        info: what is said of each episode besides the task.
+    """
+    recorders: list[_Recorder | None] = [None] * worlds.count
     finished: dict[int, Episode] = {}
     started = yielded = 0
     while yielded < len(seeds):
-        for world, recorder in enumerate(recorders):
-            if recorder is None and started < len(seeds):
-                seed = seeds[started]
-                batch.reset([seed], np.array([world]))
-                goal = batch.desired_goal[world].copy()
-                policy.begin(world, batch.state, goal, seed)
-                recorders[world] = _Recorder(started, seed, goal, batch.state[world])
+        for world in range(worlds.count):
+            if recorders[world] is None and started < len(seeds):
+                worlds.reset([seeds[started]], np.array([world]))
+                actor.begin(world, seeds[started])
+                recorders[world] = _Recorder(worlds, world, started, seeds[started])
                 started += 1
-        action = policy.act(batch.state)
-        batch.step(action)
-        over = policy.finished
+        action = actor.act()
+        worlds.step(action)
+        # Copied once for all worlds: the recorders keep rows of it.
+        seen = _Seen(worlds)
+        ended, over = seen.done | seen.truncated, actor.finished
         for world, recorder in enumerate(recorders):
-            if recorder is None:
-                continue
-            recorder.add(action[world], batch.state[world], bool(over[world]))
-            if recorder.complete(bool(batch.truncated[world])):
-                finished[recorder.order] = recorder.episode(task, noise)
-                recorders[world] = None
+            if recorder is not None:
+                recorder.add(action[world], seen, bool(over[world]))
+                if ended[world] or recorder.idle >= _TAIL_STEPS:
+                    finished[recorder.order] = recorder.episode(worlds, info)
+                    recorders[world] = None
         while yielded in finished:
             yield finished.pop(yielded)
             yielded += 1
 
 
+class _ScriptActor:
+    """A script in each world."""
+
+    def __init__(self, worlds: Worlds, policy: ScriptedPolicy) -> None:
+        self._worlds, self._policy = worlds, policy
+
+    def begin(self, world: int, seed: int) -> None:
+        goal = self._worlds.desired_goal[world].copy()
+        self._policy.begin(world, self._worlds.state, goal, seed)
+
+    def act(self) -> np.ndarray:
+        return self._policy.act(self._worlds.state)
+
+    @property
+    def finished(self) -> np.ndarray:
+        return self._policy.finished
+
+
+class _RandomActor:
+    """Uniform actions, in each world from a stream of its own."""
+
+    def __init__(self, worlds: Worlds | GymWorlds) -> None:
+        self._streams = [np.random.default_rng() for _ in range(worlds.count)]
+        self._action_dim = worlds.action_dim
+        self.finished = np.zeros(worlds.count, bool)
+
+    def begin(self, world: int, seed: int) -> None:
+        # Apart from the stream that the world itself draws its start from.
+        self._streams[world] = np.random.default_rng([seed, 2])
+
+    def act(self) -> np.ndarray:
+        rows = [stream.uniform(-1.0, 1.0, self._action_dim) for stream in self._streams]
+        return np.stack(rows).astype(np.float32)
+
+
+class _Seen:
+    """All worlds after one step."""
+
+    def __init__(self, worlds: Worlds | GymWorlds) -> None:
+        self.state = worlds.state.copy()
+        self.observation = worlds.observation.copy()
+        self.achieved_goal = worlds.achieved_goal.copy()
+        self.success = worlds.success.copy()
+        self.done = worlds.done.copy()
+        self.truncated = worlds.truncated.copy()
+
+
 class _Recorder:
-    """The states and actions of one episode in progress."""
+    """One episode in progress."""
 
-    def __init__(self, order: int, seed: int, goal: np.ndarray, state: np.ndarray) -> None:
-        self.order, self.seed, self.goal = order, seed, goal
-        self.states, self.actions = [state.copy()], []
-        self._tail = 0
+    def __init__(self, worlds: Worlds | GymWorlds, world: int, order: int, seed: int) -> None:
+        self.order, self.idle = order, 0
+        self._world, self._seed = world, seed
+        self._goal = worlds.desired_goal[world].copy()
+        self._seen = [_Seen(worlds)]
+        self._actions: list[np.ndarray] = []
 
-    def add(self, action: np.ndarray, state: np.ndarray, over: bool) -> None:
-        self.actions.append(action)
-        self.states.append(state.copy())
-        self._tail += over
+    def add(self, action: np.ndarray, seen: _Seen, over: bool) -> None:
+        """Add a step; ``over`` if the actor has finished."""
+        self._actions.append(action)
+        self._seen.append(seen)
+        self.idle += over
 
-    def complete(self, truncated: bool) -> bool:
-        return truncated or self._tail >= _TAIL_STEPS
+    def _column(self, name: str) -> np.ndarray:
+        return np.stack([getattr(seen, name)[self._world] for seen in self._seen])
 
-    def episode(self, task: Task, noise: Noise) -> Episode:
-        states = np.stack(self.states)
-        achieved = task.achieved_goal(states)
-        steps = len(self.actions)
-        truncated = np.zeros(steps, bool)
-        truncated[-1] = True
+    def episode(self, worlds: Worlds | GymWorlds, info: Mapping[str, Scalar]) -> Episode:
+        """Return the whole of it."""
+        achieved = self._column("achieved_goal")
+        done = self._column("done")[1:]
+        truncated = np.zeros(len(done), bool)
+        truncated[-1] = not done[-1]
         return Episode(
-            observation=task.observe(states),
+            observation=self._column("observation"),
             achieved_goal=achieved,
-            desired_goal=self.goal,
-            action=np.stack(self.actions).astype(np.float32),
-            reward=compute_reward(achieved[1:], self.goal),
-            done=np.zeros(steps, bool),
+            desired_goal=self._goal,
+            action=np.stack(self._actions).astype(np.float32),
+            reward=worlds.compute_reward(
+                achieved[1:], np.broadcast_to(self._goal, achieved[1:].shape)
+            ),
+            done=done,
             truncated=truncated,
-            success=is_success(achieved, self.goal),
-            sim_state=states,
-            seed=self.seed,
-            info={"task": task.name, "policy": "scripted", **asdict(noise)},
+            success=self._column("success"),
+            sim_state=self._column("state"),
+            seed=self._seed,
+            info={"task": worlds.name, **info},
         )

@@ -51,7 +51,9 @@ class SubgoalPolicy:
         reached = np.linalg.norm(achieved_goal - self.subgoal, axis=1) <= self._config.reached_m
         renew = np.flatnonzero(reached | (self.age >= self._config.every_steps))
         if len(renew):
-            self.subgoal[renew] = self._choose(observation[renew], desired_goal[renew])
+            self.subgoal[renew] = self._choose(
+                observation[renew], achieved_goal[renew], desired_goal[renew]
+            )
             self.age[renew] = 0
         self.age += 1
         action = self._agent.sac.act(
@@ -59,12 +61,15 @@ class SubgoalPolicy:
         )
         return action.cpu().numpy()
 
-    def _choose(self, observation: np.ndarray, desired_goal: np.ndarray) -> np.ndarray:
+    def _choose(
+        self, observation: np.ndarray, achieved_goal: np.ndarray, desired_goal: np.ndarray
+    ) -> np.ndarray:
         if self._config.source == "none":
             return desired_goal
         state, goal = self._tensor(observation), self._tensor(desired_goal)
         candidates, likelihood = self._propose(state, goal)
-        chosen = select(self._agent, state, goal, candidates, likelihood).cpu().numpy()
+        here = self._tensor(achieved_goal)
+        chosen = select(self._agent, state, here, candidates, likelihood).cpu().numpy()
         near = np.linalg.norm(chosen - desired_goal, axis=1) <= self._config.final_m
         return np.where(near[:, None], desired_goal, chosen)
 

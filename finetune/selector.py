@@ -1,17 +1,29 @@
-"""Which of the candidates becomes the subgoal."""
+"""Which of the candidates becomes the subgoal.
+
+``value`` is the paper's Eq. (11): the candidate of highest value. V alone is highest for a subgoal
+that is already reached, which is what the paper's failure analysis finds (its Fig. "failed").
+
+``likely`` first drops what leads nowhere: candidates that are where one is already, and those that
+the generator gives less than a tenth of the weight of its best. What is left are different ways on
+(which block next), and of these the one that is reached soonest is taken.
+"""
 
 from __future__ import annotations
+
+import math
 
 import torch
 from torch import Tensor
 
 from pretrain.agent import Agent
 
+_LEAST_WEIGHT = math.log(0.1)
+
 
 def select(
     agent: Agent,
     observation: Tensor,
-    goal: Tensor,
+    achieved_goal: Tensor,
     candidates: Tensor,
     likelihood: Tensor,
 ) -> Tensor:
@@ -20,7 +32,7 @@ def select(
     Args:
         agent: gives V and the rule.
         observation: (B, S).
-        goal: (B, G) final goals.
+        achieved_goal: (B, G) what is already so.
         candidates: (B, K, G).
         likelihood: (B, K) log-probabilities that the generator gave them.
 
@@ -31,10 +43,14 @@ def select(
     if count == 1:
         return candidates[:, 0]
     repeated = observation[:, None].expand(-1, count, -1).flatten(0, 1)
-    value = agent.sac.value(repeated, candidates.flatten(0, 1)).view(batch, count)
-    if agent.config.subgoals.selector == "route":
-        value = value + _PRIOR_WEIGHT * likelihood
-    return candidates[torch.arange(batch), value.argmax(1)]
+    score = agent.sac.value(repeated, candidates.flatten(0, 1)).view(batch, count)
+    if agent.config.subgoals.selector == "likely":
+        way = (candidates - achieved_goal[:, None]).norm(dim=-1)
+        trivial = way <= agent.config.subgoals.reached_m
+        unlikely = likelihood < likelihood.amax(1, keepdim=True) + _LEAST_WEIGHT
+        score = score - _DROPPED * (trivial.float() + unlikely.float())
+    return candidates[torch.arange(batch), score.argmax(1)]
 
 
-_PRIOR_WEIGHT = 5.0
+_DROPPED = 1e6
+"""More than any difference of values: dropped candidates come last."""

@@ -48,7 +48,7 @@ class OnlineConfig:
     offline_share: float = 0.5
     """Share of each batch that comes from the dataset."""
     cloning: float = 5.0
-    """Weight of cloning actions that led to the goal, where they are worth more than the actor's."""
+    """Weight of cloning actions that led to the goal and are worth more than the actor's."""
     generator_every: int = 4
     """Updates of SAC for one of the generator; 0 leaves the generator as it is."""
     generator_batch_size: int = 256
@@ -144,7 +144,9 @@ class Finetuner:
         self._rng = np.random.default_rng(seed)
         torch.manual_seed(seed)
         self._offline = offline
-        self._online = Trajectories(agent.layout, config.replay_size, agent.config.waypoints)
+        self._online = Trajectories(
+            agent.layout, config.replay_size, agent.config.waypoints, purposeful=False
+        )
         self._sac = SacOptimizer(agent.sac)
         self._generator = torch.optim.Adam(
             agent.proposer.parameters(), lr=config.generator_lr, fused=True
@@ -183,7 +185,8 @@ class Finetuner:
         return summarise(self._curve)
 
     def _learn(self) -> dict[str, Tensor]:
-        config, info = self.config, {}
+        config = self.config
+        info: dict[str, Tensor] = {}
         offline = round(config.offline_share * config.batch_size) if len(self._offline) else 0
         for update in range(1, config.updates + 1):
             parts = [self._online.transitions(config.batch_size - offline, self._mix, self._rng)]
@@ -220,7 +223,7 @@ class Finetuner:
         ):
             self.agent.save(self.run / "best" / checkpoint.POLICY)
         self._spent = time.monotonic() - start
-        values = {f"train/{k}": v for k, v in info.items()}
+        values: dict[str, float | Tensor] = {f"train/{k}": v for k, v in info.items()}
         values |= {f"eval/{k}": v for k, v in point.items()}
         log.write(self._round * self.config.updates, env_steps, self._spent, values)
         self._checkpoint()

@@ -30,10 +30,10 @@ class SubgoalConfig:
 
     source: Literal["generator", "random", "none"] = "generator"
     """The generator, achieved goals drawn from the dataset, or the final goal alone."""
-    candidates: int = 16
+    candidates: int = 4
     """K"""
-    selector: Literal["value", "route"] = "route"
-    """``value`` is the paper's Eq. (11); for ``route`` see ``finetune.selector``."""
+    selector: Literal["value", "likely"] = "likely"
+    """``value`` is the paper's Eq. (11); for ``likely`` see ``finetune.selector``."""
     every_steps: int = 30
     """T, the steps that a subgoal may take (Table I)."""
     reached_m: float = 0.02

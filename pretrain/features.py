@@ -21,6 +21,11 @@ _SPIN_SCALE = 0.2
 class PlainFeatures(nn.Module):
     """Standardised observation and goal, side by side."""
 
+    observation_mean: Tensor
+    observation_std: Tensor
+    goal_mean: Tensor
+    goal_std: Tensor
+
     def __init__(self, layout: Layout, moments: dict[str, Tensor]) -> None:
         super().__init__()
         for name in ("observation_mean", "observation_std", "goal_mean", "goal_std"):

@@ -45,8 +45,8 @@ def moves(achieved_goal: np.ndarray) -> list[Move]:
         achieved_goal: (T + 1, G), three coordinates an object in metres.
 
     Returns:
-        The moves in time, but for one that the end of the trajectory cuts off; consecutive moves of the same objects count as one, because a push
-        that is re-aimed is still one push.
+        The moves in time, but for one that the end of the trajectory cuts off; consecutive moves
+        of the same objects count as one, because a push that is re-aimed is still one push.
     """
     places = achieved_goal.reshape(len(achieved_goal), -1, 3)
     steps = np.linalg.norm(np.diff(places, axis=0), axis=-1).max(axis=1) > _MOVING_M

@@ -12,6 +12,8 @@ from pretrain.hindsight import Waypoints, find_waypoints
 from pretrain.layout import Layout
 from pretrain.sac import Batch
 
+_MOVED_M = 0.01
+
 
 @dataclass(frozen=True)
 class GoalMix:
@@ -38,10 +40,15 @@ class Trajectories:
         layout: the environment's.
         capacity: most rows kept; the oldest episodes make room.
         parts: the paper's n for its waypoints; None for waypoints at rest.
+        purposeful: whether the trajectories are demonstrations, which end when all is done. After
+            their last move they show how to let go and stay away.
     """
 
-    def __init__(self, layout: Layout, capacity: int, parts: int | None = None) -> None:
+    def __init__(
+        self, layout: Layout, capacity: int, parts: int | None, *, purposeful: bool
+    ) -> None:
         self._layout, self._capacity, self._parts = layout, capacity, parts
+        self._purposeful = purposeful
         self.observation = np.empty((0, layout.observation_dim), np.float32)
         self.achieved_goal = np.empty((0, layout.goal_dim), np.float32)
         self.action = np.empty((0, layout.action_dim), np.float32)
@@ -78,24 +85,31 @@ class Trajectories:
         """Rows that have an action."""
         self.leading = self.acting[self.waypoints.following[self.acting] >= 0]
         """Rows that have a waypoint after them."""
+        self._guiding = self.acting if self._purposeful else self.leading
+        self._next_rest = self._last.copy()
+        ahead = self.waypoints.following >= 0
+        self._next_rest[ahead] = self.waypoints.row[self.waypoints.following[ahead]]
+        """For each row the next waypoint, or where there is none the end of the episode."""
 
     def transitions(self, count: int, mix: GoalMix, rng: np.random.Generator) -> Batch:
         """Draw transitions with goals relabelled as the mix says."""
         kind = rng.choice(3, size=count, p=[mix.waypoint, mix.future, mix.displaced])
         rows = self.acting[rng.integers(len(self.acting), size=count)]
-        if len(self.leading):
+        if len(self._guiding):
             lead = kind == 0
-            rows[lead] = self.leading[rng.integers(len(self.leading), size=int(lead.sum()))]
+            rows[lead] = self._guiding[rng.integers(len(self._guiding), size=int(lead.sum()))]
         else:
             kind[kind == 0] = 1
         future = np.minimum(rows + rng.integers(1, mix.horizon + 1, size=count), self._last[rows])
-        source = np.where(kind == 0, 0, future)
-        source[kind == 0] = self.waypoints.row[self.waypoints.following[rows[kind == 0]]]
+        source = np.where(kind == 0, self._next_rest[rows], future)
         goal = self.achieved_goal[source]
         self._displace(goal, rows, kind == 2, rng)
         start, after = self.achieved_goal[rows], self.achieved_goal[rows + 1]
         reached = np.linalg.norm(after - goal, axis=1) <= mix.tolerance_m
-        clone = (kind < 2) & (np.linalg.norm(goal - start, axis=1) > 0.01)
+        moved = np.linalg.norm(goal - start, axis=1) > _MOVED_M
+        # What a trajectory does while nothing moves yet serves its next move, not this goal.
+        at_end = (kind == 0) & (source == self._last[rows])
+        clone = (kind < 2) & (moved | at_end)
         return Batch(
             observation=torch.from_numpy(self.observation[rows]),
             action=torch.from_numpy(self.action[rows]),

@@ -185,8 +185,8 @@ class Sac(nn.Module):
     def follow(self) -> None:
         """Let the target critic follow by ``tau``."""
         with torch.no_grad():
-            targets = list(self.target.body.parameters())
-            sources = list(self.critic.body.parameters())
+            targets: list[Tensor] = list(self.target.body.parameters())
+            sources: list[Tensor] = list(self.critic.body.parameters())
             torch._foreach_lerp_(targets, sources, self.config.tau)
 
 

@@ -47,9 +47,9 @@ class PretrainConfig:
     updates: int = 15_000
     """Updates of SAC."""
     batch_size: int = 256
-    generator_every: int = 3
+    generator_every: int = 4
     """Updates of SAC for one of the generator."""
-    generator_batch_size: int = 512
+    generator_batch_size: int = 256
     generator_lr: float = 1e-3
     validation_share: float = 0.1
     """Share of the episodes that are held out."""
@@ -190,7 +190,7 @@ def gather(
     """Copy the named episodes into memory."""
     starts, stops = arrays.episode_start[episodes], arrays.episode_start[episodes + 1]
     rows = np.concatenate([np.arange(a, b) for a, b in zip(starts, stops, strict=True)])
-    data = Trajectories(layout, len(rows), parts)
+    data = Trajectories(layout, len(rows), parts, purposeful=True)
     data.extend(
         arrays.observation[rows],
         arrays.achieved_goal[rows],

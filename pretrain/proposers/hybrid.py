@@ -43,6 +43,11 @@ class Hybrid(SubgoalProposer):
         config: the hyperparameters.
     """
 
+    observation_mean: Tensor
+    observation_std: Tensor
+    goal_mean: Tensor
+    goal_std: Tensor
+
     def __init__(self, layout: Layout, moments: dict[str, Tensor], config: HybridConfig) -> None:
         super().__init__()
         self.config = config

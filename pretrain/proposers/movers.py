@@ -49,14 +49,21 @@ class MoversConfig:
 class Movers(SubgoalProposer):
     """Mixture over movers; see the module."""
 
+    _kind: Tensor
+    _same: Tensor
+    _columns: Tensor
+    _places: Tensor
+
     def __init__(self, layout: Layout, config: MoversConfig) -> None:
         super().__init__()
         self._layout, self.config = layout, config
         count = len(layout.objects)
         kinds = torch.tensor([item.kind for item in layout.objects])
         self.register_buffer("_kind", nn.functional.one_hot(kinds, layout.kinds).float())
-        self._columns = torch.tensor([item.goal for item in layout.objects])[:, None]
-        self._columns = self._columns + torch.arange(3)
+        goals = torch.tensor([item.goal for item in layout.objects])
+        places = torch.tensor([item.observation for item in layout.objects])
+        for name, first in (("_columns", goals), ("_places", places)):
+            self.register_buffer(name, first[:, None] + torch.arange(3), persistent=False)
         token = 20 + layout.kinds
         width = config.width
         self.pairs = mlp(layout.robot_dim + 2 * token + 1, (width,), width)
@@ -97,8 +104,7 @@ class Movers(SubgoalProposer):
         return (goal[:, self._columns] - self._place(observation)) * _SCALE
 
     def _place(self, observation: Tensor) -> Tensor:
-        starts = torch.tensor([item.observation for item in self._layout.objects])
-        return observation[:, starts[:, None] + torch.arange(3)]
+        return observation[:, self._places]
 
     def propose(self, observation: Tensor, goal: Tensor, count: int) -> tuple[Tensor, Tensor]:
         """Draw candidates; the first M are the means of the components, likeliest first."""
@@ -106,10 +112,10 @@ class Movers(SubgoalProposer):
             log_weight, mean, scale = self.components(observation, goal)
             batch, movers = log_weight.shape
             order = log_weight.argsort(1, descending=True)[:, :count]
-            drawn = torch.multinomial(
-                log_weight.exp(), max(count - movers, 0) or 1, replacement=True
-            )[:, : max(count - movers, 0)]
-            which = torch.cat([order, drawn], 1)
+            which = order
+            if count > movers:
+                drawn = torch.multinomial(log_weight.exp(), count - movers, replacement=True)
+                which = torch.cat([order, drawn], 1)
             rows = torch.arange(batch)[:, None]
             chosen = mean[rows, which]
             spread = scale[rows, which] * self.config.temperature
