@@ -1,0 +1,292 @@
+"""Sharing datasets, recordings and policies on a Hub: all of it arrives, or nothing does.
+
+The endpoint and the token come from where ``huggingface_hub`` looks for them: ``HF_ENDPOINT``,
+``HF_TOKEN`` or its login.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal
+
+from eisp_data.errors import ConfigError, DataError
+from eisp_data.storage.card import CITATION, PREVIEW, dataset_card
+from eisp_data.storage.files import one_line
+from eisp_data.storage.preview import preview_png
+from eisp_data.storage.schema import CODEBASE_VERSION
+from eisp_data.storage.validate import validate
+
+Kind = Literal["dataset", "recording", "policy"]
+DATASET_FOLDERS = ("data", "meta", "videos")
+PICKLED = (".pkl", ".pickle", ".pt", ".pth", ".bin", ".ckpt", ".joblib", ".dill", ".npy", ".npz")
+"""Endings of files whose loading can run code."""
+
+
+@dataclass(frozen=True)
+class Item:
+    """One file of a push."""
+
+    path: str
+    """Its place in the repository."""
+    content: Path | bytes
+
+    @property
+    def size(self) -> int:
+        """Return its size in bytes."""
+        return len(self.content) if isinstance(self.content, bytes) else self.content.stat().st_size
+
+
+@dataclass
+class Plan:
+    """Exactly what a push would send."""
+
+    repo_id: str
+    repo_type: str
+    kind: Kind
+    items: list[Item] = field(default_factory=list)
+    tag: str = ""
+
+    def lines(self) -> list[str]:
+        """Return the plan as lines of text."""
+        total = sum(item.size for item in self.items)
+        head = f"{len(self.items)} files, {total} bytes, to the {self.repo_type} {self.repo_id}"
+        tag = [f"tag {self.tag}"] if self.tag else []
+        return [head, *(f"{item.size:>12}  {item.path}" for item in self.items), *tag]
+
+
+def kind_of(path: Path) -> Kind:
+    """Return what a folder or file holds; DataError names what is known."""
+    if (path / "meta/info.json").is_file():
+        return "dataset"
+    if (path / "config.json").is_file() and (path / "model.safetensors").is_file():
+        return "policy"
+    if path.suffix == ".mcap" or (path.is_dir() and any(path.glob("*.mcap"))):
+        return "recording"
+    raise DataError(
+        f"{path}: neither a dataset (meta/info.json), a policy (config.json and "
+        "model.safetensors) nor MCAP recordings"
+    )
+
+
+def plan_push(
+    path: Path, repo_id: str, license_name: str = "apache-2.0", citation: str = CITATION
+) -> Plan:
+    """Return what ``push`` would send, having checked all of it; nothing is sent.
+
+    A dataset must pass every check of ``validate``; a card and a preview are made for it. MCAP
+    recordings go to a repository of their own, whose name ends in ``-raw``.
+
+    Raises:
+        DataError: a check fails (its name and detail), or a policy holds a pickled file.
+        ConfigError: ``repo_id`` is not ``owner/name``.
+    """
+    if not re.fullmatch(r"[\w.-]+/[\w.-]+", repo_id) or ".." in repo_id:
+        raise ConfigError(f"repository {repo_id!r}: expected owner/name")
+    kind = kind_of(path)
+    if kind == "recording":
+        raw = repo_id if repo_id.endswith("-raw") else f"{repo_id}-raw"
+        files = [path] if path.is_file() else sorted(path.glob("*.mcap"))
+        return Plan(raw, "dataset", kind, [Item(file.name, file) for file in files])
+    if kind == "policy":
+        items = [Item(p.relative_to(path).as_posix(), p) for p in _files(path)]
+        for item in items:
+            _refuse_pickle(item.path, path / item.path)
+        return Plan(repo_id, "model", kind, items)
+    for check in validate(path):
+        if not check.passed:
+            raise DataError(f"{path}: check {check.name!r} fails: {check.detail}; repair it first")
+    items = [
+        Item(p.relative_to(path).as_posix(), p) for f in DATASET_FOLDERS for p in _files(path / f)
+    ]
+    own = path / "README.md"
+    card = (
+        own.read_bytes() if own.is_file() else dataset_card(path, license_name, citation).encode()
+    )
+    items += [Item("README.md", card), Item(PREVIEW, preview_png(path))]
+    return Plan(repo_id, "dataset", kind, items, tag=CODEBASE_VERSION)
+
+
+def push(plan: Plan, private: bool = False) -> str:
+    """Send a plan in one commit and return its address.
+
+    An upload that was cut goes on where it stopped: files that have arrived are not sent again,
+    and nobody sees any of them before all have. What an earlier push left and this one has not
+    (``data``, ``meta`` and ``videos`` only) is removed in the same commit.
+
+    Raises:
+        DataError: the Hub cannot be reached or refuses.
+    """
+    from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi
+
+    api = HfApi()
+    with _one_line_errors(f"{plan.repo_id}: push"):
+        api.create_repo(plan.repo_id, repo_type=plan.repo_type, private=private, exist_ok=True)
+        operations: list[Any] = [
+            CommitOperationAdd(
+                path_in_repo=item.path,
+                path_or_fileobj=str(item.content)
+                if isinstance(item.content, Path)
+                else item.content,
+            )
+            for item in plan.items
+        ]
+        if plan.kind == "dataset":
+            sent = {item.path for item in plan.items}
+            for there in api.list_repo_files(plan.repo_id, repo_type=plan.repo_type):
+                if there not in sent and there.split("/")[0] in DATASET_FOLDERS:
+                    operations.append(CommitOperationDelete(path_in_repo=there))
+        commit = api.create_commit(
+            plan.repo_id,
+            operations,
+            commit_message=f"Upload {plan.kind}",
+            repo_type=plan.repo_type,
+        )
+        if plan.tag:
+            refs = api.list_repo_refs(plan.repo_id, repo_type=plan.repo_type)
+            if any(ref.name == plan.tag for ref in refs.tags):
+                api.delete_tag(plan.repo_id, tag=plan.tag, repo_type=plan.repo_type)
+            api.create_tag(
+                plan.repo_id, tag=plan.tag, revision=commit.oid, repo_type=plan.repo_type
+            )
+    return str(commit.commit_url)
+
+
+def pull(repo_id: str, to: Path, repo_type: str = "dataset", revision: str | None = None) -> int:
+    """Fetch a dataset, recordings or a policy into the new folder ``to``; return its bytes.
+
+    Every file's checksum is compared with the one the Hub states; a dataset must pass ``validate``.
+    Until then everything is in a hidden folder beside ``to``, which is removed on any failure.
+
+    Args:
+        repo_id: ``owner/name``.
+        to: folder to make.
+        repo_type: ``dataset`` or ``model``.
+        revision: branch, tag or commit; the default branch if left out.
+
+    Raises:
+        DataError: ``to`` exists, the Hub cannot be reached, a path climbs out of the folder, a
+            file is pickled, a checksum is wrong, or the dataset is damaged.
+    """
+    from huggingface_hub import HfApi
+
+    if to.exists():
+        raise DataError(f"{to}: exists already; choose another folder")
+    partial = to.with_name(f".{to.name}.{os.getpid()}.partial")
+    api = HfApi()
+    try:
+        with _one_line_errors(f"{repo_id}: pull"):
+            commit = api.repo_info(repo_id, repo_type=repo_type, revision=revision).sha
+            entries = [
+                entry
+                for entry in api.list_repo_tree(
+                    repo_id, recursive=True, repo_type=repo_type, revision=commit
+                )
+                if hasattr(entry, "size")
+            ]
+            for entry in entries:
+                _refuse_path(entry.path)
+            total = sum(entry.size for entry in entries)
+            partial.mkdir(parents=True)
+            if shutil.disk_usage(partial).free < total:
+                raise DataError(f"{to}: {total} bytes do not fit on the disk")
+            for entry in entries:
+                api.hf_hub_download(
+                    repo_id, entry.path, repo_type=repo_type, revision=commit, local_dir=partial
+                )
+                _verify(partial / entry.path, entry)
+        # Its download notes would make LeRobot fetch the dataset again.
+        shutil.rmtree(partial / ".cache", ignore_errors=True)
+        if (partial / "meta/info.json").is_file():
+            for check in validate(partial):
+                if not check.passed:
+                    raise DataError(f"{repo_id}: check {check.name!r} fails: {check.detail}")
+        os.rename(partial, to)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return total
+
+
+def _files(folder: Path) -> list[Path]:
+    """Return the files under a folder but hidden ones and links, in order."""
+    return sorted(
+        path
+        for path in folder.rglob("*")
+        if path.is_file()
+        and not path.is_symlink()
+        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+    )
+
+
+def _refuse_path(path: str) -> None:
+    """Raise DataError for a path that leaves the folder or names a pickled file."""
+    parts = PurePosixPath(path).parts
+    if (
+        not parts
+        or path.startswith("/")
+        or ".." in parts
+        or "\\" in path
+        or ":" in parts[0]
+        or "\0" in path
+    ):
+        raise DataError(f"path {path!r} climbs out of the folder; nothing was fetched")
+    if PurePosixPath(path).suffix.lower() in PICKLED:
+        raise DataError(f"file {path!r} may be pickled, and loading it can run code; refused")
+
+
+def _refuse_pickle(name: str, path: Path) -> None:
+    """Raise DataError for a file that is pickled by its name or its first bytes."""
+    _refuse_path(name)
+    with path.open("rb") as file:
+        head = file.read(4)
+    # A pickle of protocol 2 and up, or the zip in which PyTorch wraps one.
+    if (len(head) >= 2 and head[0] == 0x80 and 2 <= head[1] <= 5) or head == b"PK\x03\x04":
+        raise DataError(f"file {name!r} is pickled, and loading it can run code; refused")
+
+
+def _verify(path: Path, entry: Any) -> None:
+    """Compare a file with the checksum of its entry: SHA-256 of LFS, git's SHA-1 of others."""
+    _refuse_pickle(entry.path, path)
+    if entry.lfs:
+        expected, digest = entry.lfs.sha256, hashlib.sha256()
+    else:
+        expected, digest = entry.blob_id, hashlib.sha1(b"blob %d\0" % path.stat().st_size)
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    if digest.hexdigest() != expected:
+        raise DataError(f"file {entry.path!r} does not have the checksum that the Hub states")
+
+
+@contextmanager
+def _one_line_errors(what: str) -> Iterator[None]:
+    """Turn what the client and the network raise into a DataError of one line."""
+    import httpx
+    from huggingface_hub.errors import (
+        EntryNotFoundError,
+        HfHubHTTPError,
+        HFValidationError,
+        OfflineModeIsEnabled,
+        RepositoryNotFoundError,
+        RevisionNotFoundError,
+    )
+
+    try:
+        yield
+    except (RepositoryNotFoundError, RevisionNotFoundError, EntryNotFoundError) as error:
+        raise DataError(
+            f"{what}: not found or not visible ({one_line(error)})"
+        ) from None
+    except HfHubHTTPError as error:
+        raise DataError(f"{what}: the Hub refused ({one_line(error)})") from None
+    except OfflineModeIsEnabled:
+        raise DataError(f"{what}: HF_HUB_OFFLINE is set; unset it to reach a Hub") from None
+    except (httpx.HTTPError, HFValidationError, OSError, RuntimeError, ValueError) as error:
+        cause = error.__cause__ or error
+        raise DataError(f"{what}: failed ({one_line(cause)}); run it again to go on") from None
