@@ -111,10 +111,9 @@ def convert(
         first = load(log, mapping, config.clock)
     spec = _spec(config, mapping, first)
     recipe = _recipe(config, mapping, first, paths)
-    del first
     with DatasetWriter(config.to, spec, recipe, resume=config.resume) as writer:
         before = writer.num_episodes
-        made = _made(paths, mapping, rate, spec.task, before, report)
+        made = _made(paths, first, mapping, rate, spec.task, before, report)
         for batch in _batches(made):
             writer.write([m.episode for m in batch], [m.extras for m in batch])
             for m in batch:
@@ -130,17 +129,19 @@ def convert(
 
 def _made(
     paths: list[Path],
+    first: Recording,
     mapping: Mapping,
     rate: Rate,
     task: str,
     skip: int,
     report: ConvertReport,
 ) -> Iterator[Made]:
-    """Yield the episodes of all files but the first ``skip``."""
-    for path in paths:
+    """Yield the episodes of all files but the first ``skip``; ``first`` is of the first file."""
+    for number, path in enumerate(paths):
         with McapLog(path) as log:
-            assembler = Assembler(log, load(log, mapping, rate.clock), rate, task)
-            report.lines += [f"{path.name}: {problem}" for problem in log.problems]
+            recording = load(log, mapping, rate.clock) if number else first
+            assembler = Assembler(log, recording, rate, task)
+            report.lines += [f"{path.name}: {problem}" for problem in recording.problems]
             for made in assembler.episodes(skip):
                 if made is None:
                     skip -= 1

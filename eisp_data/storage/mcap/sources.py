@@ -24,6 +24,8 @@ class Recording:
     sources: list[Source]
     events: list[decode.Event]
     """In the order of their times, which are set."""
+    problems: list[str]
+    """What could not be read, one line each."""
 
 
 def load(log: McapLog, mapping: Mapping, clock: Clock) -> Recording:
@@ -54,11 +56,10 @@ def load(log: McapLog, mapping: Mapping, clock: Clock) -> Recording:
             collector.add(entry, decoded, clock)
     events.sort(key=lambda event: event.time_ns or 0)
     try:
-        return Recording(
-            [_source(s, parts) for s, parts in zip(streams, collectors, strict=True)], events
-        )
+        sources = [_source(s, parts) for s, parts in zip(streams, collectors, strict=True)]
     except DataError as error:
         raise DataError(f"{log.path}: {error}") from None
+    return Recording(sources, events, log.problems)
 
 
 def _source(stream: StreamMap, parts: list[Collector]) -> Source:

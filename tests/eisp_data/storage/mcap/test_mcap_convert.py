@@ -286,6 +286,16 @@ def test_a_recording_that_was_cut_off_gives_the_episodes_that_are_left(
     assert any("cut off" in line for line in report.lines)
 
 
+def test_a_damaged_chunk_is_named_in_the_report(session_file: Path, tmp_path: Path) -> None:
+    with McapLog(session_file) as log:
+        chunk = log.layout.segments[2]
+    data = bytearray(session_file.read_bytes())
+    data[chunk.offset + 300] ^= 1
+    (tmp_path / "bad.mcap").write_bytes(data)
+    _, report = run(tmp_path / "bad.mcap", tmp_path / "d")
+    assert any(f"bad.mcap: byte {chunk.offset}" in line for line in report.lines)
+
+
 def test_samples_that_are_not_finite_count_as_missing(tmp_path: Path) -> None:
     with McapWriter(tmp_path / "x.mcap", FAST) as writer:
         for k in range(26):

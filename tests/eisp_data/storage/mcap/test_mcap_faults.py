@@ -67,7 +67,7 @@ def killed(script: str, arguments: list[str], delay_s: float) -> list[str]:
 
 
 def test_a_recorder_that_is_killed_loses_one_second_at_most(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(KILLS)
     worst = 0.0
     for number in range(KILLS):
         path = tmp_path / f"{number}.mcap"
@@ -108,7 +108,7 @@ def test_a_conversion_killed_again_and_again_ends_in_the_same_dataset(tmp_path: 
     source = record_session(tmp_path / "run.mcap", episodes=12, steps=10)
     convert(ConvertConfig(inputs=(source,), to=tmp_path / "whole"))
     whole = list(read_episodes(tmp_path / "whole", images=True))
-    rng = np.random.default_rng(1)
+    rng = np.random.default_rng(KILLS)
     target = tmp_path / "killed"
     for _ in range(max(2, KILLS // 2)):
         killed(CONVERT, [str(source), str(target)], float(rng.uniform(0.0, 0.8)))
