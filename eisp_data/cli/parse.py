@@ -32,6 +32,7 @@ def parse(
     prog: str | None = None,
     about: str | None = None,
     config_file: bool = False,
+    default: Any = None,
 ) -> Any:
     """Return the options that a command line gives.
 
@@ -41,6 +42,7 @@ def parse(
         prog: name of the command in its help.
         about: what the command does, for its help.
         config_file: offer ``--config FILE.yaml``.
+        default: an instance of ``kind`` that the flags start from, if no file is given.
 
     Raises:
         ConfigError: an unknown or missing flag, a value that cannot be used, or a bad ``--config``.
@@ -48,6 +50,8 @@ def parse(
     """
     rest = list(sys.argv[1:] if words is None else words)
     settings: dict[str, Any] = {"prog": prog, "description": about or ""}
+    if default is not None:
+        settings["default"] = default
     if config_file:
         settings["description"] += f"\n\n{_CONFIG_HELP}"
         rest, file = _split_config(rest)

@@ -20,6 +20,7 @@ def run(
     args: Sequence[str] | None = None,
     prog: str | None = None,
     config_file: bool = False,
+    default: Any = None,
 ) -> Any:
     """Parse ``args`` (the command line, if left out) into ``function``'s options and call it.
 
@@ -29,6 +30,7 @@ def run(
         args: words of the command line.
         prog: name of the command in its help.
         config_file: offer ``--config FILE.yaml``, which starts from a saved configuration.
+        default: options that the flags start from, if no file is given.
 
     Returns:
         What ``function`` returns.
@@ -39,7 +41,7 @@ def run(
     hints.pop("return", None)
     (kind,) = hints.values()
     try:
-        return function(parse(kind, args, prog, inspect.getdoc(function), config_file))
+        return function(parse(kind, args, prog, inspect.getdoc(function), config_file, default))
     except EispError as error:
         fail(str(error))
     except BrokenPipeError:  # whoever read the output, ``head`` for example, has had enough
