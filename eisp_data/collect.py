@@ -12,10 +12,11 @@ from eisp_data.episode import Episode, Scalar
 from eisp_data.policies.script import Noise, Script, ScriptedPolicy
 from eisp_data.sim.gym_worlds import GymWorlds
 from eisp_data.sim.worlds import Worlds
-from eisp_data.tasks.base import Task
+from eisp_data.tasks.base import Task, is_success
 
-_TAIL_STEPS = 5
-"""An episode goes on this long after its script has ended, for what is falling to come to rest."""
+_TAIL_STEPS = 10
+"""An episode goes on this long after its script has ended: what is falling comes to rest, and the
+data show what to do when all is done."""
 
 
 class Actor(Protocol):
@@ -132,11 +133,12 @@ class _Seen:
 
     def __init__(self, worlds: Worlds | GymWorlds) -> None:
         self.state = worlds.state.copy()
-        self.observation = worlds.observation.copy()
-        self.achieved_goal = worlds.achieved_goal.copy()
-        self.success = worlds.success.copy()
         self.done = worlds.done.copy()
         self.truncated = worlds.truncated.copy()
+        if isinstance(worlds, GymWorlds):
+            self.observation = worlds.observation.copy()
+            self.achieved_goal = worlds.achieved_goal.copy()
+            self.success = worlds.success.copy()
 
 
 class _Recorder:
@@ -160,22 +162,31 @@ class _Recorder:
 
     def episode(self, worlds: Worlds | GymWorlds, info: Mapping[str, Scalar]) -> Episode:
         """Return the whole of it."""
-        achieved = self._column("achieved_goal")
+        state = self._column("state")
+        if isinstance(worlds, Worlds):
+            # Of this episode's states alone: the last bit of what numpy computes for a row may
+            # depend on how many rows there are.
+            observation = worlds.task.observe(state)
+            achieved = worlds.task.achieved_goal(state)
+            success = is_success(achieved, self._goal)
+        else:
+            observation, achieved, success = map(
+                self._column, ("observation", "achieved_goal", "success")
+            )
         done = self._column("done")[1:]
         truncated = np.zeros(len(done), bool)
         truncated[-1] = not done[-1]
+        desired = np.broadcast_to(self._goal, achieved[1:].shape)
         return Episode(
-            observation=self._column("observation"),
+            observation=observation,
             achieved_goal=achieved,
             desired_goal=self._goal,
             action=np.stack(self._actions).astype(np.float32),
-            reward=worlds.compute_reward(
-                achieved[1:], np.broadcast_to(self._goal, achieved[1:].shape)
-            ),
+            reward=worlds.compute_reward(achieved[1:], desired),
             done=done,
             truncated=truncated,
-            success=self._column("success"),
-            sim_state=self._column("state"),
+            success=success,
+            sim_state=state,
             seed=self._seed,
             info={"task": worlds.name, **info},
         )

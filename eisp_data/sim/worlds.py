@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from eisp_data.tasks.base import Task, is_success
+from eisp_data.tasks.base import Task, compute_reward, is_success
 
 
 class Worlds:
@@ -91,3 +91,17 @@ class Worlds:
     def truncated(self) -> np.ndarray:
         """(N,) bool: the episode has had its L steps."""
         return self.steps >= self.episode_steps
+
+    @property
+    def done(self) -> np.ndarray:
+        """(N,) bool: False, for the goal has to hold until the end."""
+        return np.zeros(self.count, bool)
+
+    @property
+    def action_dim(self) -> int:
+        """A."""
+        return self.task.paper.action_dim
+
+    def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray) -> np.ndarray:
+        """Return the paper's Eq. (1) for (n, G) goals, (n,) float32."""
+        return compute_reward(achieved_goal, desired_goal)
