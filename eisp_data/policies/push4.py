@@ -22,9 +22,9 @@ _PUSH_STEPS = 30
 _DRAWS = 40
 _FASTEST_M, _SLOWEST_M = 0.036, 0.005
 """Displacements commanded per step while pushing."""
-_START_M = 0.008
+_START_M = 0.014
 """A push begins this slowly and gains as much with each step: a block that is hit tumbles."""
-_BRAKE_M_S2 = 4.5
+_BRAKE_M_S2 = 5.0
 """The friction of the table stops a block at 6.9 m/s2: braked harder, it slides on by itself."""
 _BACK_M = 0.012
 
@@ -90,14 +90,14 @@ def follow(view: View, push: Push, fastest_m: float = _FASTEST_M) -> Iterator[Ke
         if left @ push.normal < _ARRIVED_M or not is_behind(view.gripper[:2], block, push.normal):
             break
         way = float(np.linalg.norm(left))
-        length = min(_START_M * (step + 1), fastest_m, _braking(way))
+        length = min(_START_M * (step + 1), fastest_m, braking(way))
         ahead = view.gripper[:2] + left / way * max(length, _SLOWEST_M)
         yield Keyframe(np.append(ahead, _LOW_M), CLOSED, tolerance_m=0.0, most_steps=1)
     back = view.gripper[:2] - _BACK_M * push.normal
     yield Keyframe(np.append(back, _LOW_M), CLOSED, tolerance_m=0.0, most_steps=1)
 
 
-def _braking(way_m: float) -> float:
+def braking(way_m: float) -> float:
     """Return the longest next step after which the braking way still fits in what is left."""
     period = 1.0 / CONTROL_HZ
     speed = _BRAKE_M_S2 * (np.sqrt(period**2 + 2 * way_m / _BRAKE_M_S2) - period)

@@ -143,7 +143,12 @@ def _asides(
     blocks: np.ndarray, targets: np.ndarray, todo: tuple[int, ...]
 ) -> list[tuple[int, np.ndarray]]:
     """Return (block, place) pairs, short detours on the way to the block's own target first."""
-    pairs = [(block, place) for block in todo for place in _grid()]
+    pairs = [
+        (block, place)
+        for block in todo
+        for place in _grid()
+        if np.linalg.norm(place - blocks[block]) >= _GRID_STEP_M
+    ]
 
     def detour(pair: tuple[int, np.ndarray]) -> float:
         block, place = pair
