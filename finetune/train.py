@@ -24,7 +24,8 @@ from finetune.rollout import SubgoalPolicy
 from pretrain import checkpoint
 from pretrain.agent import Agent
 from pretrain.metrics import MetricsLog
-from pretrain.replay import GoalMix, Trajectories
+from pretrain.config import GoalMix
+from pretrain.replay import Trajectories
 from pretrain.sac import Batch, SacOptimizer
 from pretrain.train import update_generator
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from safetensors.torch import load_file, save_file
@@ -13,49 +12,16 @@ from torch import Tensor, nn
 
 from eisp_data.config import from_plain, to_plain
 from eisp_data.errors import ConfigError, DataError
+from pretrain.config import AgentConfig
 from pretrain.features import ObjectFeatures, PlainFeatures
 from pretrain.layout import Layout
-from pretrain.proposers.hybrid import Hybrid, HybridConfig
-from pretrain.proposers.movers import Movers, MoversConfig
+from pretrain.proposers.hybrid import Hybrid
+from pretrain.proposers.movers import Movers
 from pretrain.proposers.proposer import SubgoalProposer
-from pretrain.sac import Sac, SacConfig
+from pretrain.sac import Sac
 
 BANK = 4096
 """Achieved goals of the dataset that an agent carries with it, for random subgoals."""
-
-
-@dataclass(frozen=True)
-class SubgoalConfig:
-    """When and how subgoals are chosen during a rollout (the paper's Algorithm 1)."""
-
-    source: Literal["generator", "random", "none"] = "generator"
-    """The generator, achieved goals drawn from the dataset, or the final goal alone."""
-    candidates: int = 4
-    """K"""
-    selector: Literal["value", "likely"] = "likely"
-    """``value`` is the paper's Eq. (11); for ``likely`` see ``finetune.selector``."""
-    every_steps: int = 30
-    """T, the steps that a subgoal may take (Table I)."""
-    reached_m: float = 0.02
-    """A subgoal is reached within this distance (the paper's epsilon)."""
-    final_m: float = 0.05
-    """A subgoal this near to the final goal gives way to it (the paper's epsilon)."""
-
-
-@dataclass(frozen=True)
-class AgentConfig:
-    """An agent's parts."""
-
-    task: str
-    """Name of the task, or id of the environment."""
-    features: Literal["objects", "plain"] = "objects"
-    generator: Literal["movers", "hybrid"] = "movers"
-    waypoints: int | None = None
-    """The paper's n, which cuts trajectories evenly; None cuts them where objects rest."""
-    sac: SacConfig = field(default_factory=SacConfig)
-    movers: MoversConfig = field(default_factory=MoversConfig)
-    hybrid: HybridConfig = field(default_factory=HybridConfig)
-    subgoals: SubgoalConfig = field(default_factory=SubgoalConfig)
 
 
 class Agent(nn.Module):

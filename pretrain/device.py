@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import torch
 
 from eisp_data.errors import ConfigError
 from eisp_data.sim.physics import default_threads
-
-DeviceName = Literal["auto", "cpu", "cuda"]
+from pretrain.config import DeviceName
 
 
 def set_up(device: DeviceName, threads: int | None) -> str:

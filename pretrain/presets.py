@@ -12,11 +12,15 @@ from typing import Literal
 from eisp_data.errors import ConfigError
 from eisp_data.tasks.base import SUCCESS_DISTANCE_M
 from eisp_data.tasks.registry import TASKS
-from pretrain.agent import AgentConfig, SubgoalConfig
-from pretrain.proposers.hybrid import HybridConfig
-from pretrain.replay import GoalMix
-from pretrain.sac import SacConfig
-from pretrain.train import DatasetConfig, PretrainConfig
+from pretrain.config import (
+    AgentConfig,
+    DatasetConfig,
+    GoalMix,
+    HybridConfig,
+    PretrainConfig,
+    SacConfig,
+    SubgoalConfig,
+)
 
 PresetName = Literal["cpu", "paper"]
 

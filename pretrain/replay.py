@@ -2,33 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from torch import Tensor
 
+from pretrain.config import GoalMix
 from pretrain.hindsight import Waypoints, find_waypoints
 from pretrain.layout import Layout
 from pretrain.sac import Batch
 
 _MOVED_M = 0.01
-
-
-@dataclass(frozen=True)
-class GoalMix:
-    """Which goals the low-level policy learns from."""
-
-    waypoint: float = 0.5
-    """Share of goals that are the next waypoint: what a subgoal generator will ask for."""
-    future: float = 0.3
-    """Share of goals achieved a little later in the same trajectory."""
-    displaced: float = 0.2
-    """Share of goals that send one object to where it, or its like, lay at another time."""
-    horizon: int = 40
-    """How many steps later a ``future`` goal may lie."""
-    tolerance_m: float = 0.05
-    """epsilon of Eq. (1) for these goals: tighter than the task's, because errors add up."""
 
 
 class Trajectories:

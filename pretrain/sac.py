@@ -13,32 +13,12 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor, nn
 
+from pretrain.config import SacConfig
 from pretrain.networks import EnsembleMLP, mlp
 
 Info = dict[str, Tensor]
 
 _LOG_STD_MIN, _LOG_STD_MAX = -5.0, 1.0
-
-
-@dataclass(frozen=True)
-class SacConfig:
-    """Soft Actor-Critic."""
-
-    layers: tuple[int, ...] = (256, 256)
-    """Hidden sizes of actor and critics (Table I: pi)."""
-    lr: float = 3e-4
-    alpha: float = 0.01
-    """Temperature, fixed (Table I: alpha)."""
-    gamma: float = 0.99
-    """Discount (Table I: gamma)."""
-    tau: float = 0.005
-    """Share of the critic that enters its target at each update."""
-    layer_norm: bool = True
-    """Normalise the critics' hidden layers; off in the paper's preset."""
-    clip_targets: bool = True
-    """Clip the critics' targets to [-1 / (1 - gamma), 0], all that Eq. (1) allows."""
-    cloning: float = 20.0
-    """Weight of cloning the actions that led to the goal, offline; 0 is plain SAC."""
 
 
 @dataclass

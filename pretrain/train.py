@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -16,51 +15,16 @@ from eisp_data.errors import ConfigError, DataError
 from eisp_data.storage.cache import DatasetArrays, load_arrays
 from eisp_data.tasks.registry import TASKS
 from pretrain import checkpoint
-from pretrain.agent import BANK, Agent, AgentConfig
-from pretrain.device import DeviceName, describe, set_up
+from pretrain.agent import BANK, Agent
+from pretrain.config import PretrainConfig
+from pretrain.device import describe, set_up
 from pretrain.layout import Layout
 from pretrain.metrics import MetricsLog
-from pretrain.replay import GoalMix, Trajectories
+from pretrain.replay import Trajectories
 from pretrain.sac import SacOptimizer
 
 _VALIDATION_SAMPLES = 4096
 _NEAR_M = 0.05
-
-
-@dataclass(frozen=True)
-class DatasetConfig:
-    """A dataset on the disk."""
-
-    root: Path
-    """Its folder."""
-
-
-@dataclass(frozen=True)
-class PretrainConfig:
-    """Offline pretraining."""
-
-    dataset: DatasetConfig
-    output_dir: Path
-    """Where the run goes."""
-    agent: AgentConfig
-    mix: GoalMix = field(default_factory=GoalMix)
-    updates: int = 15_000
-    """Updates of SAC."""
-    batch_size: int = 256
-    generator_every: int = 4
-    """Updates of SAC for one of the generator."""
-    generator_batch_size: int = 256
-    generator_lr: float = 1e-3
-    validation_share: float = 0.1
-    """Share of the episodes that are held out."""
-    validate_every: int = 1_000
-    """Updates between validations, each followed by a checkpoint."""
-    seed: int = 0
-    device: DeviceName = "auto"
-    threads: int | None = None
-    """Threads of the networks on a processor; all cores if left out."""
-    resume: bool = False
-    """Go on from the newest checkpoint in the output folder."""
 
 
 def pretrain(config: PretrainConfig) -> Path:

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import inspect
-import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from typing import Any, NoReturn, get_type_hints
 
-from eisp_data.cli.parse import parse
 from eisp_data.errors import EispError
 
 USER_ERROR = 2
@@ -18,16 +15,17 @@ USER_ERROR = 2
 def run(
     function: Callable[[Any], Any],
     args: Sequence[str] | None = None,
-    prog: str | None = None,
+    prog: str = "",
+    *,
     config_file: bool = False,
     default: Any = None,
 ) -> Any:
-    """Parse ``args`` (the command line, if left out) into ``function``'s options and call it.
+    """Parse ``args`` into the options that ``function`` takes, and call it.
 
     Args:
-        function: takes one dataclass of options, whose fields become the flags; its docstring is
-            the command's help.
-        args: words of the command line.
+        function: its one parameter, annotated, is a dataclass of options; its docstring is what
+            the command's help says.
+        args: words of the command line; those of the process if None.
         prog: name of the command in its help.
         config_file: offer ``--config FILE.yaml``, which starts from a saved configuration.
         default: options that the flags start from, if no file is given.
@@ -35,19 +33,20 @@ def run(
     Returns:
         What ``function`` returns.
 
-    An ``EispError`` is printed as one line on stderr, and the process exits with status 2.
+    An ``EispError``, or a file that cannot be reached, is printed as one line on stderr, and the
+    process exits with status 2.
     """
+    from eisp_data.cli.parse import parse
+
     hints = get_type_hints(function, include_extras=True)
     hints.pop("return", None)
-    (kind,) = hints.values()
+    [kind] = hints.values()
     try:
-        return function(parse(kind, args, prog, inspect.getdoc(function), config_file, default))
+        options = parse(kind, args, prog or None, function.__doc__, config_file, default)
+        return function(options)
     except EispError as error:
         fail(str(error))
-    except BrokenPipeError:  # whoever read the output, ``head`` for example, has had enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(128 + 13)
-    except OSError as error:  # a folder that cannot be read, a full disk
+    except OSError as error:  # a folder that may not be read, a full disk
         fail(f"{error.filename or prog}: {error.strerror or error}")
     except KeyboardInterrupt:
         sys.exit(130)
@@ -55,8 +54,7 @@ def run(
 
 def fail(message: str) -> NoReturn:
     """Print one line and exit as after a user's mistake."""
-    line = " ".join(message.split())
-    print(f"error: {line}", file=sys.stderr)
+    print(f"error: {' '.join(message.split())}", file=sys.stderr)
     sys.exit(USER_ERROR)
 
 

@@ -10,27 +10,16 @@ it is the negative ELBO, to be minimised.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor, nn
 
+from pretrain.config import HybridConfig
 from pretrain.layout import Layout
 from pretrain.networks import mlp
 from pretrain.proposers import laplace
 from pretrain.proposers.proposer import Info, SubgoalProposer
 
 _LEAST_SCALE = 1e-3
-
-
-@dataclass(frozen=True)
-class HybridConfig:
-    """The paper's generator."""
-
-    layers: tuple[int, ...] = (256, 256)
-    """Hidden sizes of encoder and decoder (Table I: psi)."""
-    beta: float = 1e-2
-    """Weight of L_HS (Table I: beta)."""
 
 
 class Hybrid(SubgoalProposer):

@@ -14,11 +14,10 @@ divergence are the paper's.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor, nn
 
+from pretrain.config import MoversConfig
 from pretrain.features import object_tokens, scaled_robot
 from pretrain.layout import Layout
 from pretrain.networks import mlp
@@ -28,22 +27,6 @@ from pretrain.proposers.proposer import Info, SubgoalProposer
 _SCALE = 10.0
 """Lengths are in decimetres inside the networks."""
 _LEAST_SCALE, _MOST_SCALE = 0.02, 2.0
-
-
-@dataclass(frozen=True)
-class MoversConfig:
-    """The mixture generator."""
-
-    width: int = 128
-    """Size of all hidden layers."""
-    likelihood: float = 1.0
-    """Weight of L_HS, the negative log-likelihood of the hindsight subgoals."""
-    reconstruction: float = 0.01
-    """Weight of the decoder's -log p(g | subgoal, s)."""
-    divergence: float = 1e-3
-    """Weight of KL(encoder || prior)."""
-    temperature: float = 0.3
-    """Candidates are drawn with the Laplace scales multiplied by this."""
 
 
 class Movers(SubgoalProposer):

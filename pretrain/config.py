@@ -1,0 +1,146 @@
+"""Every setting of pretraining, each beside its meaning.
+
+Kept apart from the code that it configures because that needs torch, which takes seconds to import;
+a command line has to be read before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+DeviceName = Literal["auto", "cpu", "cuda"]
+
+
+@dataclass(frozen=True)
+class SacConfig:
+    """Soft Actor-Critic."""
+
+    layers: tuple[int, ...] = (256, 256)
+    """Hidden sizes of actor and critics (Table I: pi)."""
+    lr: float = 3e-4
+    alpha: float = 0.01
+    """Temperature, fixed (Table I: alpha)."""
+    gamma: float = 0.99
+    """Discount (Table I: gamma)."""
+    tau: float = 0.005
+    """Share of the critic that enters its target at each update."""
+    layer_norm: bool = True
+    """Normalise the critics' hidden layers; off in the paper's preset."""
+    clip_targets: bool = True
+    """Clip the critics' targets to [-1 / (1 - gamma), 0], all that Eq. (1) allows."""
+    cloning: float = 20.0
+    """Weight of cloning the actions that led to the goal, offline; 0 is plain SAC."""
+
+
+@dataclass(frozen=True)
+class MoversConfig:
+    """The mixture generator."""
+
+    width: int = 128
+    """Size of all hidden layers."""
+    likelihood: float = 1.0
+    """Weight of L_HS, the negative log-likelihood of the hindsight subgoals."""
+    reconstruction: float = 0.01
+    """Weight of the decoder's -log p(g | subgoal, s)."""
+    divergence: float = 1e-3
+    """Weight of KL(encoder || prior)."""
+    temperature: float = 0.3
+    """Candidates are drawn with the Laplace scales multiplied by this."""
+
+
+@dataclass(frozen=True)
+class HybridConfig:
+    """The paper's generator."""
+
+    layers: tuple[int, ...] = (256, 256)
+    """Hidden sizes of encoder and decoder (Table I: psi)."""
+    beta: float = 1e-2
+    """Weight of L_HS (Table I: beta)."""
+
+
+@dataclass(frozen=True)
+class SubgoalConfig:
+    """When and how subgoals are chosen during a rollout (the paper's Algorithm 1)."""
+
+    source: Literal["generator", "random", "none"] = "generator"
+    """The generator, achieved goals drawn from the dataset, or the final goal alone."""
+    candidates: int = 4
+    """K"""
+    selector: Literal["value", "likely"] = "likely"
+    """``value`` is the paper's Eq. (11); for ``likely`` see ``finetune.selector``."""
+    every_steps: int = 30
+    """T, the steps that a subgoal may take (Table I)."""
+    reached_m: float = 0.02
+    """A subgoal is reached within this distance (the paper's epsilon)."""
+    final_m: float = 0.05
+    """A subgoal this near to the final goal gives way to it (the paper's epsilon)."""
+
+
+@dataclass(frozen=True)
+class AgentConfig:
+    """An agent's parts."""
+
+    task: str
+    """Name of the task, or id of the environment."""
+    features: Literal["objects", "plain"] = "objects"
+    generator: Literal["movers", "hybrid"] = "movers"
+    waypoints: int | None = None
+    """The paper's n, which cuts trajectories evenly; None cuts them where objects rest."""
+    sac: SacConfig = field(default_factory=SacConfig)
+    movers: MoversConfig = field(default_factory=MoversConfig)
+    hybrid: HybridConfig = field(default_factory=HybridConfig)
+    subgoals: SubgoalConfig = field(default_factory=SubgoalConfig)
+
+
+@dataclass(frozen=True)
+class GoalMix:
+    """Which goals the low-level policy learns from."""
+
+    waypoint: float = 0.5
+    """Share of goals that are the next waypoint: what a subgoal generator will ask for."""
+    future: float = 0.3
+    """Share of goals achieved a little later in the same trajectory."""
+    displaced: float = 0.2
+    """Share of goals that send one object to where it, or its like, lay at another time."""
+    horizon: int = 40
+    """How many steps later a ``future`` goal may lie."""
+    tolerance_m: float = 0.05
+    """epsilon of Eq. (1) for these goals: tighter than the task's, because errors add up."""
+
+
+@dataclass(frozen=True)
+class DatasetConfig:
+    """A dataset on the disk."""
+
+    root: Path
+    """Its folder."""
+
+
+@dataclass(frozen=True)
+class PretrainConfig:
+    """Offline pretraining."""
+
+    dataset: DatasetConfig
+    output_dir: Path
+    """Where the run goes."""
+    agent: AgentConfig
+    mix: GoalMix = field(default_factory=GoalMix)
+    updates: int = 15_000
+    """Updates of SAC."""
+    batch_size: int = 256
+    generator_every: int = 4
+    """Updates of SAC for one of the generator."""
+    generator_batch_size: int = 256
+    generator_lr: float = 1e-3
+    validation_share: float = 0.1
+    """Share of the episodes that are held out."""
+    validate_every: int = 1_000
+    """Updates between validations, each followed by a checkpoint."""
+    seed: int = 0
+    device: DeviceName = "auto"
+    threads: int | None = None
+    """Threads of the networks on a processor; all cores if left out."""
+    resume: bool = False
+    """Go on from the newest checkpoint in the output folder."""
