@@ -155,7 +155,8 @@ class Assembler:
         length_ns = window.end_ns - int(times[start])
         count = (length_ns + self.period_ns // 2) // self.period_ns + 1
         self._check_size(count)
-        return int(times[start]) + self.period_ns * np.arange(count)
+        window.first_row_ns = int(times[start])
+        return window.first_row_ns + self.period_ns * np.arange(count)
 
     def _runs(self, window: Window, ticks: np.ndarray) -> list[np.ndarray]:
         """Return the unbroken stretches of ``ticks`` in which no source is too old."""
@@ -173,8 +174,10 @@ class Assembler:
 
     def _asked(self, source: Source, window: Window, ticks: np.ndarray) -> np.ndarray:
         """Return the times at which ``source`` is looked up, never beyond the episode's end."""
-        late = self.period_ns if source.stream.to == GOAL else 0
-        return np.minimum(ticks + late, window.end_ns)
+        if source.stream.to == GOAL:
+            # What is said an instant after the first action still is the goal of the first row.
+            ticks = np.maximum(ticks, window.first_row_ns + self.period_ns)
+        return np.minimum(ticks, window.end_ns)
 
     def _split_by_goal(self, window: Window, ticks: np.ndarray) -> list[np.ndarray]:
         """Cut where the desired goal changes: a goal that changes starts a new episode."""

@@ -38,6 +38,11 @@ class Backlog:
         self.dropped: Counter[str] = Counter()
         """Topic to messages refused since the start."""
 
+    @property
+    def waiting_bytes(self) -> int:
+        """How much is in memory now."""
+        return self._bytes
+
     def put(self, item: Item, bulky: bool) -> bool:
         """Add ``item`` without waiting; return False, and count it, if there is no room."""
         limit = self.limit_bytes * 3 // 4 if bulky else self.limit_bytes

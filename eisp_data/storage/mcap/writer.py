@@ -75,6 +75,8 @@ class WriterStats:
     """Topic to messages in the file."""
     dropped: Mapping[str, int]
     """Topic to messages for which the queue had no room."""
+    waiting_bytes: int
+    """What is in memory and not yet in the file."""
 
 
 _NOT_A_NAME = ("", "camera", "color", "image", "image_raw", "image_rect", "compressed")
@@ -205,8 +207,9 @@ class McapWriter:
         return self.log(EVENTS_TOPIC, messages.event(kind, at, details), at, "events")
 
     def stats(self) -> WriterStats:
-        """Return how many messages are in the file and how many were dropped, by topic."""
-        return WriterStats(dict(self._written), dict(self._backlog.dropped))
+        """Return how many messages were written and dropped, by topic, and what is waiting."""
+        backlog = self._backlog
+        return WriterStats(dict(self._written), dict(backlog.dropped), backlog.waiting_bytes)
 
     def close(self) -> WriterStats:
         """Write what is waiting, the index and the footer; raises DataError if that failed."""

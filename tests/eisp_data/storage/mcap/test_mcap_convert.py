@@ -202,8 +202,30 @@ def test_a_goal_that_changes_starts_a_new_episode(tmp_path: Path) -> None:
                 writer.vector("/goal", [k], at, role="observation.desired_goal")
     episodes, _ = run(tmp_path / "y.mcap", tmp_path / "d")
     assert [e.desired_goal.tolist() for e in episodes] == [[0.0], [10.0]]
-    # The goal is looked up one row ahead, for it may be said an instant after the command.
-    assert [len(e) for e in episodes] == [9, 16]
+    assert [len(e) for e in episodes] == [10, 15]
+    # Both hold the observation at which the goal changed.
+    assert episodes[0].observation[-1, 0] == episodes[1].observation[0, 0] == 10
+    assert not episodes[0].done.any() and episodes[0].truncated[-1]
+
+
+def test_a_goal_said_an_instant_after_the_first_command_is_that_of_the_first_row(
+    tmp_path: Path,
+) -> None:
+    with McapWriter(tmp_path / "x.mcap", FAST) as writer:
+        for episode in range(2):
+            start = START_NS + episode * 2_000_000_000
+            writer.event("episode_start", start)
+            for k in range(10):
+                at = start + k * PERIOD_NS
+                writer.log("/joint_states", messages.joints(["a"], [k], at), at)
+                writer.vector("/reached", [k], at, role="observation.achieved_goal")
+                writer.vector("/command", [0.0], at, role="action")
+                if k == 0:
+                    late = at + 3 * MS
+                    writer.vector("/goal", [episode], late, role="observation.desired_goal")
+            writer.event("episode_end", at)
+    episodes, _ = run(tmp_path / "x.mcap", tmp_path / "d")
+    assert [(len(e), e.desired_goal.tolist()) for e in episodes] == [(9, [0.0]), (9, [1.0])]
 
 
 def test_a_jittering_control_loop_loses_and_doubles_no_command(tmp_path: Path) -> None:

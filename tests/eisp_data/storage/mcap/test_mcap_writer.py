@@ -110,10 +110,12 @@ def test_a_stalled_disk_costs_images_first_and_each_drop_is_flagged(
     with McapWriter(path, McapWriterConfig(queue_bytes=100_000)) as writer:
         taken = [writer.image("/camera/top/image", frame) for _ in range(30)]
         commands = [writer.vector("/command", [0.0]) for _ in range(20)]
+        assert 0 < writer.stats().waiting_bytes <= 100_000
         go_on.set()
     dropped = taken.count(False)
     assert 0 < dropped < 30 and all(commands)
     assert writer.stats().dropped == {"/camera/top/image": dropped}
+    assert writer.stats().waiting_bytes == 0
     with McapLog(path) as log:
         stats = log.stats()
         flagged = [
