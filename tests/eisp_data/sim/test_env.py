@@ -102,7 +102,7 @@ def test_envs_run_in_processes_of_gymnasiums_own():
 
 
 def test_an_unknown_task_or_render_mode_is_named_with_the_choices():
-    with pytest.raises(ConfigError, match="unknown task 'stak'.*stack"):
+    with pytest.raises(ConfigError, match=r"unknown task 'stak'.*stack"):
         TaskEnv("stak")
-    with pytest.raises(ConfigError, match="unknown render_mode 'human'.*rgb_array"):
+    with pytest.raises(ConfigError, match=r"unknown render_mode 'human'.*rgb_array"):
         TaskEnv("stack", render_mode="human")
