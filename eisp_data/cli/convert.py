@@ -8,7 +8,7 @@ from pathlib import Path
 import tyro
 from tqdm import tqdm
 
-from eisp_data.storage.mcap.convert import ConvertConfig
+from eisp_data.storage.mcap.convert import ConvertConfig, suggested_mapping
 from eisp_data.storage.mcap.convert import convert as convert_recordings
 
 
@@ -18,10 +18,16 @@ class Convert(ConvertConfig):
 
     inputs: tyro.conf.Positional[tuple[Path, ...]]
     """MCAP files, or folders of them (ROS 2 bags are such folders), in this order."""
+    show_mapping: bool = False
+    """Print the mapping that the first recording suggests, to be saved and edited; write nothing.
+    """
 
 
 def convert(options: tyro.conf.OmitArgPrefixes[Convert]) -> None:
     """Make a LeRobot dataset of MCAP recordings or ROS 2 bags; print what was left out."""
+    if options.show_mapping:
+        print(suggested_mapping(options), end="")
+        return
     with tqdm(desc="episodes", unit="") as bar:
         report = convert_recordings(options, lambda episodes: bar.update(episodes - bar.n) and None)
     for line in report.lines:

@@ -55,7 +55,7 @@ def validate(options: tyro.conf.OmitArgPrefixes[Validate]) -> None:
     elif options.path.is_file():
         from eisp_data.storage.mcap.check import checks as check_recording
 
-        results = [checks.Check(c.name, c.passed, c.detail) for c in check_recording(options.path)]
+        results = check_recording(options.path)
     else:
         raise DataError(f"{options.path}: no such file or folder")
     print("\n".join(checks.table(results)))

@@ -127,6 +127,11 @@ def convert(
     return report
 
 
+def suggested_mapping(config: ConvertConfig) -> str:
+    """Return the text of the mapping file that ``convert`` would use, to be edited by hand."""
+    return _mapping(config, find_inputs(config.inputs)[0]).to_yaml()
+
+
 def _made(
     paths: list[Path],
     first: Recording,

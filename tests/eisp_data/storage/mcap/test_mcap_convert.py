@@ -14,7 +14,12 @@ from eisp_data.errors import ConfigError, DataError
 from eisp_data.storage.lerobot import read_episodes
 from eisp_data.storage.mcap import assemble, messages
 from eisp_data.storage.mcap import convert as convert_module
-from eisp_data.storage.mcap.convert import ConvertConfig, ConvertReport, convert
+from eisp_data.storage.mcap.convert import (
+    ConvertConfig,
+    ConvertReport,
+    convert,
+    suggested_mapping,
+)
 from eisp_data.storage.mcap.reader import McapLog
 from eisp_data.storage.mcap.writer import McapWriter
 
@@ -86,6 +91,17 @@ def test_lerobot_opens_what_was_converted(session_file: Path, tmp_path: Path) ->
     assert item["action"][0] == pytest.approx(0.05)
     assert item["observation.images.top"].shape == (3, 32, 48)
     assert item["task"] == "Stack it."
+
+
+def test_the_suggested_mapping_used_as_a_file_gives_the_same_rows(
+    session_file: Path, tmp_path: Path
+) -> None:
+    text = suggested_mapping(ConvertConfig(inputs=(session_file,), to=tmp_path))
+    (tmp_path / "mapping.yaml").write_text(text)
+    run(session_file, tmp_path / "a")
+    run(session_file, tmp_path / "b", mapping=tmp_path / "mapping.yaml")
+    a, b = rows(tmp_path / "a"), rows(tmp_path / "b")
+    assert a.keys() == b.keys() and all(np.array_equal(a[n], b[n]) for n in a)
 
 
 def test_converting_twice_gives_the_same_rows(session_file: Path, tmp_path: Path) -> None:
