@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -139,7 +141,8 @@ class GymWorlds:
 
 def _make(env_id: str) -> gymnasium.Env[Any, Any]:
     """Return the environment; its module may stand before its id, as in ``my_package:MyEnv-v0``."""
-    import gymnasium_robotics
+    with contextlib.redirect_stderr(io.StringIO()):  # it greets with news of other environments
+        import gymnasium_robotics
 
     gymnasium.register_envs(gymnasium_robotics)
     try:
