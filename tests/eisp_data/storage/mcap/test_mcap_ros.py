@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -288,3 +289,43 @@ def test_a_message_that_is_cut_short_is_one_line(bag: Path, cut: int) -> None:
                 decode.Decoder().decode(channel, log.schema_of(channel), data)
             except DataError as error:
                 assert topic in str(error) and "\n" not in str(error)
+
+
+def test_messages_with_flipped_bits_decode_or_are_refused_in_one_line(bag: Path) -> None:
+    (path,) = bag.glob("*.mcap")
+    rng = np.random.default_rng(5)
+    refused = 0
+    with McapLog(path) as log:
+        for topic, channel in log.topics.items():
+            original = next(log.messages({topic})).message.data
+            for _ in range(100):
+                data = bytearray(original)
+                for place in rng.integers(len(data), size=4):
+                    data[place] ^= 1 << int(rng.integers(8))
+                try:
+                    got = decode.Decoder().decode(channel, log.schema_of(channel), bytes(data))
+                    if isinstance(got, decode.Picture):
+                        pixels.rgb(got)
+                except DataError as error:
+                    refused += 1
+                    assert "\n" not in str(error)
+    assert refused > 50
+
+
+def test_a_definition_that_is_damaged_is_refused_in_one_line(bag: Path) -> None:
+    (path,) = bag.glob("*.mcap")
+    rng = np.random.default_rng(6)
+    with McapLog(path) as log:
+        for topic, channel in log.topics.items():
+            schema = log.schema_of(channel)
+            assert schema is not None
+            message = next(log.messages({topic})).message
+            for _ in range(30):
+                text = bytearray(schema.data)
+                for place in rng.integers(len(text), size=3):
+                    text[place] ^= 1 << int(rng.integers(8))
+                bad = replace(schema, data=bytes(text))
+                try:
+                    decode.Decoder().decode(channel, bad, message.data)
+                except DataError as error:
+                    assert "\n" not in str(error)
