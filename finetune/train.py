@@ -48,8 +48,10 @@ class OnlineConfig:
     batch_size: int = 256
     offline_share: float = 0.5
     """Share of each batch that comes from the dataset."""
-    cloning: float = 5.0
-    """Weight of cloning actions that led to the goal and are worth more than the actor's."""
+    lr: float = 3e-4
+    """Of SAC."""
+    cloning: float = 20.0
+    """Weight of cloning the actions that led to the goal."""
     generator_every: int = 4
     """Updates of SAC for one of the generator; 0 leaves the generator as it is."""
     generator_batch_size: int = 256
@@ -148,7 +150,7 @@ class Finetuner:
         self._online = Trajectories(
             agent.layout, config.replay_size, agent.config.waypoints, purposeful=False
         )
-        self._sac = SacOptimizer(agent.sac)
+        self._sac = SacOptimizer(agent.sac, config.lr)
         self._generator = torch.optim.Adam(
             agent.proposer.parameters(), lr=config.generator_lr, fused=True
         )
@@ -194,7 +196,7 @@ class Finetuner:
             if offline:
                 parts.append(self._offline.transitions(offline, self._mix, self._rng))
             batch = Batch.joined(parts).to(self._device)
-            info |= self._sac.update(batch, config.cloning, only_better=True)
+            info |= self._sac.update(batch, config.cloning)
             if config.generator_every and update % config.generator_every == 0:
                 source = self._offline
                 if not offline or self._rng.random() >= config.offline_share:

@@ -100,6 +100,7 @@ class Trajectories:
             goal=torch.from_numpy(goal),
             reward=torch.from_numpy(reached.astype(np.float32) - 1.0),
             clone=torch.from_numpy(clone.astype(np.float32)),
+            demonstrated=torch.full((count,), float(self._purposeful)),
         )
 
     def _displace(

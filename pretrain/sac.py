@@ -37,6 +37,8 @@ class Batch:
     """(B,) Eq. (1) for that goal, 0 or -1."""
     clone: Tensor
     """(B,) 1 where the trajectory went on to bring its objects to this goal, else 0."""
+    demonstrated: Tensor
+    """(B,) 1 where the trajectory is a demonstration, else 0."""
 
     @classmethod
     def joined(cls, parts: Sequence[Batch]) -> Batch:
@@ -137,26 +139,23 @@ class Sac(nn.Module):
         loss = (value - target).square().mean()
         return loss, {"critic_loss": loss.detach(), "value": value.detach().mean()}
 
-    def actor_loss(self, batch: Batch, cloning: float, only_better: bool) -> tuple[Tensor, Info]:
+    def actor_loss(self, batch: Batch, cloning: float) -> tuple[Tensor, Info]:
         """Return E [alpha log pi - min Q] plus the cloning term.
 
-        Args:
-            batch: transitions.
-            cloning: weight of the cloning term.
-            only_better: clone an action only where it is worth more than the actor's (Nair et al.
-                2018, "Q-filter").
+        Demonstrated actions are cloned as they are, the policy's own only where they are worth
+        more than what it would do now (Nair et al. 2018, "Q-filter").
         """
         action, log_prob, mean = self.actor.sample(batch.observation, batch.goal)
         value = self.critic(batch.observation, batch.goal, action).amin(0)
         loss = (self.config.alpha * log_prob - value).mean()
         info = {"actor_loss": loss.detach(), "entropy": -log_prob.detach().mean()}
         if cloning:
-            error = (mean - batch.action).square().sum(-1)
             chosen = batch.clone
-            if only_better:
+            if not batch.demonstrated.all():
                 with torch.no_grad():
                     shown = self.critic(batch.observation, batch.goal, batch.action).amin(0)
-                chosen = chosen * (shown > value.detach())
+                chosen = chosen * torch.maximum(batch.demonstrated, (shown > value).float())
+            error = (mean - batch.action).square().sum(-1)
             clone = (chosen * error).sum() / chosen.sum().clamp(min=1.0)
             loss = loss + cloning * clone
             info["cloning_error"] = clone.detach()
@@ -173,19 +172,19 @@ class Sac(nn.Module):
 class SacOptimizer:
     """One update after another."""
 
-    def __init__(self, sac: Sac) -> None:
+    def __init__(self, sac: Sac, lr: float) -> None:
         self.sac = sac
-        self.actor = torch.optim.Adam(sac.actor.parameters(), lr=sac.config.lr, fused=True)
-        self.critic = torch.optim.Adam(sac.critic.parameters(), lr=sac.config.lr, fused=True)
+        self.actor = torch.optim.Adam(sac.actor.parameters(), lr=lr, fused=True)
+        self.critic = torch.optim.Adam(sac.critic.parameters(), lr=lr, fused=True)
 
-    def update(self, batch: Batch, cloning: float, only_better: bool = False) -> Info:
-        """Update critics, actor and target on one batch; for the rest see ``Sac.actor_loss``."""
+    def update(self, batch: Batch, cloning: float) -> Info:
+        """Update critics, actor and target on one batch."""
         loss, critic_info = self.sac.critic_loss(batch)
         self.critic.zero_grad(set_to_none=True)
         loss.backward()
         self.critic.step()
         self.sac.critic.requires_grad_(False)
-        loss, actor_info = self.sac.actor_loss(batch, cloning, only_better)
+        loss, actor_info = self.sac.actor_loss(batch, cloning)
         self.actor.zero_grad(set_to_none=True)
         loss.backward()
         self.actor.step()

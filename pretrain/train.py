@@ -38,7 +38,7 @@ def pretrain(config: PretrainConfig) -> Path:
     rng = np.random.default_rng(config.seed)
     bank = train.achieved_goal[rng.integers(len(train), size=BANK)]
     agent = Agent(config.agent, layout, train.moments(), torch.from_numpy(bank)).to(device)
-    sac = SacOptimizer(agent.sac)
+    sac = SacOptimizer(agent.sac, config.agent.sac.lr)
     generator = torch.optim.Adam(agent.proposer.parameters(), lr=config.generator_lr, fused=True)
     optimizers = {"actor": sac.actor, "critic": sac.critic, "generator": generator}
     done, best, best_state, spent = 0, -np.inf, {}, 0.0

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from eisp_data.policies.push4 import approach, follow
+from eisp_data.policies.push4 import approach, braking, follow
 from eisp_data.policies.push_plan import possible_pushes
 from eisp_data.policies.script import CLOSED, Aim, Keyframe, View
 from eisp_data.sim.drawer import BAR_HALF_M, HANDLE_CLOSED_M, HANDLE_GAP_M
@@ -23,6 +23,8 @@ _MISPLACED_M = 0.02
 _PUSHES = 4
 _FASTEST_PUSH_M = 0.026
 """A block that is pushed alone and far stays on the fingers at this displacement per step."""
+_START_M, _SLOWEST_M, _ARRIVED_M = 0.008, 0.005, 0.004
+_GLIDE_STEPS = 40
 
 
 def opening_of(handle: np.ndarray) -> float:
@@ -39,7 +41,7 @@ def push_block(view: View, aim: Aim, place: np.ndarray) -> Iterator[Keyframe]:
         push = next((push for push in possible_pushes(0, block, place) if push), None)
         if push is None:
             return
-        push = replace(push, target=aim.at(np.append(push.target, 0.0))[:2])
+        push = replace(push, target=aim.destination(np.append(push.target, 0.0))[:2])
         yield from approach(view, push)
         if view.gripper[2] < _LOWERED_M:
             yield from follow(view, push, _FASTEST_PUSH_M)
@@ -56,7 +58,23 @@ def slide_drawer(view: View, aim: Aim, opening_m: float) -> Iterator[Keyframe]:
     yield Keyframe(_at(behind, _OVER_M), CLOSED, tolerance_m=0.010)
     yield Keyframe(_at(behind, _HOOK_M), CLOSED, tolerance_m=0.012)
     end = HANDLE_CLOSED_M[0] - opening_m + (_BAR_BEFORE_M if pull else _PANEL_BEHIND_M)
-    yield Keyframe(np.array([end, behind[1], _HOOK_M]), CLOSED, tolerance_m=0.006)
+    if pull:
+        yield Keyframe(np.array([end, behind[1], _HOOK_M]), CLOSED, tolerance_m=0.006)
+    else:
+        yield from _glide(view, end)
+    yield Keyframe(_at(view.gripper, _OVER_M), CLOSED, tolerance_m=0.02)
+
+
+def _glide(view: View, end_x_m: float) -> Iterator[Keyframe]:
+    """Move along x, gaining and losing speed so gently that a block in the tray stays there."""
+    start = view.gripper
+    for step in range(_GLIDE_STEPS):
+        way = end_x_m - view.gripper[0]
+        if abs(way) < _ARRIVED_M:
+            break
+        length = max(min(_START_M * (step + 1), braking(abs(way))), _SLOWEST_M)
+        ahead = view.gripper[0] + np.copysign(length, way)
+        yield Keyframe(np.array([ahead, start[1], _HOOK_M]), CLOSED, 0.0, most_steps=1)
 
 
 def _at(position: np.ndarray, height_m: float) -> np.ndarray:

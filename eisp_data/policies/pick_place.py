@@ -35,7 +35,7 @@ def pick(view: View, aim: Aim, block: int, height_m: float) -> Iterator[Keyframe
 
 def place(view: View, aim: Aim, target: np.ndarray, height_m: float) -> Iterator[Keyframe]:
     """Carry the held block over the target at a height that clears everything, set it down."""
-    target = aim.at(target)
+    target = aim.destination(target)
     yield Keyframe(lifted(view.gripper, height_m), CLOSED, tolerance_m=0.015)
     yield Keyframe(lifted(target, height_m), CLOSED, tolerance_m=0.010)
     yield Keyframe(target + [0, 0, 0.003], CLOSED, tolerance_m=0.006)

@@ -54,7 +54,7 @@ def _arrange(view: View, aim: Aim, targets: np.ndarray, most: int) -> Iterator[K
         if push is None or len(touched | {push.block}) > most:
             return
         touched.add(push.block)
-        push = replace(push, target=aim.at(np.append(push.target, 0.0))[:2])
+        push = replace(push, target=aim.destination(np.append(push.target, 0.0))[:2])
         yield from approach(view, push)
         if view.gripper[2] < _LOWERED_M:
             yield from follow(view, push)

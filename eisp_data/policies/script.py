@@ -20,6 +20,7 @@ import numpy as np
 from eisp_data.tasks.base import ACTION_SCALE_M, Task
 
 OPEN, CLOSED = 1.0, -1.0
+_BLUNDER_M = 0.06
 _LEAST_EFFORT = 0.25
 
 
@@ -48,6 +49,9 @@ class Noise:
     Wolpert 1998)."""
     aim_std_m: float = 0.0
     """Standard deviation of the places that a script aims at, drawn anew for each."""
+    blunder: float = 0.0
+    """Probability that an object is brought to a place up to 6 cm off in x and in y. What the script
+    then does about it is what a policy has to know in order to recover."""
     slowest: float = 1.0
     """Each episode moves at a share of full speed drawn from [slowest, 1]."""
     slip: float = 0.0
@@ -105,8 +109,15 @@ class Aim:
 
     def at(self, position: np.ndarray) -> np.ndarray:
         """Return the position as this demonstrator hits it: displaced in the plane."""
-        miss = np.append(self.rng.normal(0.0, self.noise.aim_std_m, 2), 0.0)
-        return position + np.clip(miss, -3 * self.noise.aim_std_m, 3 * self.noise.aim_std_m)
+        miss = np.clip(self.rng.normal(0.0, 1.0, 2), -3.0, 3.0) * self.noise.aim_std_m
+        return position + np.append(miss, 0.0)
+
+    def destination(self, position: np.ndarray) -> np.ndarray:
+        """Return where this demonstrator brings what belongs at the position."""
+        if self.noise.blunder and self.rng.random() < self.noise.blunder:
+            miss = self.rng.uniform(-_BLUNDER_M, _BLUNDER_M, 2)
+            return position + np.append(miss, 0.0)
+        return self.at(position)
 
     def part(self, whole: int) -> int:
         """Return how much of a task of so many parts to do."""
