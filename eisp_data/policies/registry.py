@@ -27,7 +27,7 @@ DEMONSTRATOR: dict[str, Noise] = {
     ),
     "push4": Noise(action_std=0.15, aim_std_m=0.004, slowest=0.6, partial=True, whole_share=0.06),
     "open_drawer": Noise(
-        action_std=0.15, aim_std_m=0.004, slowest=0.6, partial=True, whole_share=0.07
+        action_std=0.15, aim_std_m=0.004, slowest=0.6, partial=True, whole_share=0.06
     ),
     "store": Noise(
         action_std=0.15,

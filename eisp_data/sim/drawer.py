@@ -60,7 +60,7 @@ def _drawer() -> str:
     inside, back = front + 0.012, front + 0.132
     thick, side = BAR_HALF_M, 0.070
     boxes = [
-        _box((front, -0.080, 0.003), (inside, 0.080, 0.066), _FRONT, "front"),
+        _box((front, -0.080, 0.003), (inside, 0.080, 0.050), _FRONT, "front"),
         _box((inside, -side, 0.002), (back, side, 0.010), _WOOD, "tray"),
         _box((inside, side, 0.002), (back, side + 0.006, TRAY_WALL_TOP_M), _WOOD),
         _box((inside, -side - 0.006, 0.002), (back, -side, TRAY_WALL_TOP_M), _WOOD),

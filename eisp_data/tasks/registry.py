@@ -7,8 +7,9 @@ from eisp_data.tasks.base import Task
 from eisp_data.tasks.open_drawer import OpenDrawer
 from eisp_data.tasks.push4 import Push4
 from eisp_data.tasks.stack import Stack
+from eisp_data.tasks.store import Store
 
-TASKS: dict[str, Task] = {task.name: task for task in (Stack(), Push4(), OpenDrawer())}
+TASKS: dict[str, Task] = {task.name: task for task in (Stack(), Push4(), OpenDrawer(), Store())}
 
 
 def get_task(name: str) -> Task:
