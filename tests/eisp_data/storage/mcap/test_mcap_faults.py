@@ -28,6 +28,7 @@ from eisp_data.storage.mcap.convert import ConvertConfig, convert
 from eisp_data.storage.mcap.reader import McapLog
 from eisp_data.storage.mcap.repair import repair
 from eisp_data.storage.mcap.writer import McapWriterConfig
+from eisp_data.storage.validate import validate
 
 KILLS = int(os.environ.get("EISP_KILLS", "5"))
 MUTATIONS = int(os.environ.get("EISP_MUTATIONS", "100"))
@@ -97,7 +98,7 @@ from pathlib import Path
 from eisp_data.storage.mcap import convert as module
 module._BATCH_EPISODES = 2
 config = module.ConvertConfig(
-    inputs=(Path(sys.argv[1]),), to=Path(sys.argv[2]), resume=Path(sys.argv[2]).exists()
+    inputs=(Path(sys.argv[1]),), to=Path(sys.argv[2]), resume=True
 )
 print("ready", flush=True)
 module.convert(config)
@@ -111,15 +112,16 @@ def test_a_conversion_killed_again_and_again_ends_in_the_same_dataset(tmp_path: 
     rng = np.random.default_rng(KILLS)
     target = tmp_path / "killed"
     for _ in range(max(2, KILLS // 2)):
-        killed(CONVERT, [str(source), str(target)], float(rng.uniform(0.0, 0.8)))
-        if (target / "meta/info.json").exists():
-            convert(ConvertConfig(inputs=(source,), to=target, resume=True))
-            got = list(read_episodes(target, images=True))
-            assert len(got) == len(whole)
-            for a, b in zip(got, whole, strict=True):
-                assert np.array_equal(a.observation, b.observation) and a.info == b.info
-                assert a.images["top"].shape == b.images["top"].shape
-        shutil.rmtree(target, ignore_errors=True)
+        for _ in range(2):
+            killed(CONVERT, [str(source), str(target)], float(rng.uniform(0.0, 0.5)))
+        convert(ConvertConfig(inputs=(source,), to=target, resume=True))
+        got = list(read_episodes(target, images=True))
+        assert len(got) == len(whole)
+        for a, b in zip(got, whole, strict=True):
+            assert np.array_equal(a.observation, b.observation) and a.info == b.info
+            assert a.images["top"].shape == b.images["top"].shape
+        assert all(check.passed for check in validate(target))
+        shutil.rmtree(target)
 
 
 def mutate(data: bytes, rng: np.random.Generator) -> tuple[str, bytes]:
@@ -200,7 +202,7 @@ def test_damaged_files_give_one_line_or_a_correct_result(
                 assert str(error) and "\n" not in str(error), f"{number} {kind} {name}"
                 refused[name] += 1
             except Exception as error:
-                path.rename(f"/tmp/bad-{number}.mcap")
+                path.rename(tmp_path / f"bad-{number}.mcap")
                 raise AssertionError(f"mutation {number} ({kind}): {name}: {error!r}") from error
         assert path.read_bytes() == data
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024
