@@ -19,12 +19,12 @@ from tqdm import tqdm
 
 from eisp_data.errors import ConfigError
 from eisp_data.sim.worlds import Worlds
+from finetune.config import OnlineConfig
 from finetune.evaluate import Evaluation, evaluate
 from finetune.rollout import SubgoalPolicy
 from pretrain import checkpoint
 from pretrain.agent import Agent
 from pretrain.metrics import MetricsLog
-from pretrain.config import GoalMix
 from pretrain.replay import Trajectories
 from pretrain.sac import Batch, SacOptimizer
 from pretrain.train import update_generator
@@ -33,34 +33,6 @@ _SELECTION_SEED = 500_000_000
 """Seeds from here on choose among checkpoints; none of them is ever reported on."""
 _TRAINING_SEED = 1_000_000_000
 """Seeds from here on are the worlds that are learned in."""
-
-
-@dataclass(frozen=True)
-class OnlineConfig:
-    """Online fine-tuning."""
-
-    rounds: int = 40
-    worlds: int = 32
-    round_steps: int = 50
-    """Steps of every world in a round."""
-    updates: int = 300
-    """Updates of SAC in a round."""
-    batch_size: int = 256
-    offline_share: float = 0.5
-    """Share of each batch that comes from the dataset."""
-    lr: float = 3e-4
-    """Of SAC."""
-    cloning: float = 20.0
-    """Weight of cloning the actions that led to the goal."""
-    generator_every: int = 4
-    """Updates of SAC for one of the generator; 0 leaves the generator as it is."""
-    generator_batch_size: int = 256
-    generator_lr: float = 3e-4
-    replay_size: int = 1_000_000
-    """Rows kept of the worlds' trajectories (Table I: D)."""
-    evaluate_every: int = 5
-    """Rounds between evaluations, each followed by a checkpoint."""
-    evaluation_episodes: int = 100
 
 
 @dataclass
@@ -94,7 +66,7 @@ class Rollouts:
             worlds.step(action)
         rows.append((worlds.observation, worlds.achieved_goal, np.zeros_like(action)))
         columns = [np.stack(column, 1) for column in zip(*rows, strict=True)]
-        self.start(np.flatnonzero(worlds.truncated | worlds.success))
+        self.start(np.flatnonzero(worlds.truncated | worlds.done | worlds.success))
         starts = np.arange(worlds.count + 1) * (steps + 1)
         return *(c.reshape(-1, c.shape[-1]) for c in columns), starts
 
@@ -125,7 +97,6 @@ class Finetuner:
         agent: what is fine-tuned.
         offline: the dataset that it was pretrained on.
         make_worlds: makes a batch of worlds of a given size.
-        mix: the goals that the low-level policy learns from.
         config: the hyperparameters.
         seed: of the run.
         device: where the agent is.
@@ -137,13 +108,12 @@ class Finetuner:
         agent: Agent,
         offline: Trajectories,
         make_worlds: Callable[[int], Worlds],
-        mix: GoalMix,
         config: OnlineConfig,
         seed: int,
         device: str,
     ) -> None:
         self.run, self.agent, self.config = run, agent, config
-        self._mix, self._device = mix, device
+        self._mix, self._device = agent.config.mix, device
         self._rng = np.random.default_rng(seed)
         torch.manual_seed(seed)
         self._offline = offline

@@ -79,22 +79,6 @@ class SubgoalConfig:
 
 
 @dataclass(frozen=True)
-class AgentConfig:
-    """An agent's parts."""
-
-    task: str
-    """Name of the task, or id of the environment."""
-    features: Literal["objects", "plain"] = "objects"
-    generator: Literal["movers", "hybrid"] = "movers"
-    waypoints: int | None = None
-    """The paper's n, which cuts trajectories evenly; None cuts them where objects rest."""
-    sac: SacConfig = field(default_factory=SacConfig)
-    movers: MoversConfig = field(default_factory=MoversConfig)
-    hybrid: HybridConfig = field(default_factory=HybridConfig)
-    subgoals: SubgoalConfig = field(default_factory=SubgoalConfig)
-
-
-@dataclass(frozen=True)
 class GoalMix:
     """Which goals the low-level policy learns from."""
 
@@ -108,6 +92,23 @@ class GoalMix:
     """How many steps later a ``future`` goal may lie."""
     tolerance_m: float = 0.05
     """epsilon of Eq. (1) for these goals: tighter than the task's, because errors add up."""
+
+
+@dataclass(frozen=True)
+class AgentConfig:
+    """An agent's parts."""
+
+    task: str
+    """Name of the task, or id of the environment."""
+    features: Literal["objects", "plain"] = "objects"
+    generator: Literal["movers", "hybrid"] = "movers"
+    waypoints: int | None = None
+    """The paper's n, which cuts trajectories evenly; None cuts them where objects rest."""
+    sac: SacConfig = field(default_factory=SacConfig)
+    movers: MoversConfig = field(default_factory=MoversConfig)
+    hybrid: HybridConfig = field(default_factory=HybridConfig)
+    subgoals: SubgoalConfig = field(default_factory=SubgoalConfig)
+    mix: GoalMix = field(default_factory=GoalMix)
 
 
 @dataclass(frozen=True)
@@ -126,7 +127,6 @@ class PretrainConfig:
     output_dir: Path
     """Where the run goes."""
     agent: AgentConfig
-    mix: GoalMix = field(default_factory=GoalMix)
     updates: int = 15_000
     """Updates of SAC."""
     batch_size: int = 256

@@ -41,9 +41,9 @@ def _cpu(task: str, root: Path, output_dir: Path) -> PretrainConfig:
             features="objects" if known else "plain",
             generator="movers" if known else "hybrid",
             sac=SacConfig(lr=1e-3, gamma=0.98),
+            # Each of n objects may be off by a share of the task's tolerance.
+            mix=GoalMix(tolerance_m=SUCCESS_DISTANCE_M / objects**0.5),
         ),
-        # Each of n objects may be off by a share of the task's tolerance.
-        mix=GoalMix(tolerance_m=SUCCESS_DISTANCE_M / objects**0.5),
     )
 
 
@@ -75,8 +75,8 @@ def _paper(task: str, root: Path, output_dir: Path) -> PretrainConfig:
                 every_steps=table.subgoal_steps,
                 reached_m=SUCCESS_DISTANCE_M,
             ),
+            mix=GoalMix(waypoint=0.0, future=1.0, displaced=0.0, horizon=table.episode_steps),
         ),
-        mix=GoalMix(waypoint=0.0, future=1.0, displaced=0.0, horizon=table.episode_steps),
         batch_size=table.batch_size,
         generator_every=1,
         generator_batch_size=table.batch_size,

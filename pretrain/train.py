@@ -51,7 +51,7 @@ def pretrain(config: PretrainConfig) -> Path:
     info: dict[str, Tensor] = {}
     steps = range(done + 1, config.updates + 1)
     for update in tqdm(steps, "pretraining", config.updates, initial=done, mininterval=1.0):
-        batch = train.transitions(config.batch_size, config.mix, rng)
+        batch = train.transitions(config.batch_size, config.agent.mix, rng)
         info |= sac.update(batch.to(device), config.agent.sac.cloning)
         if update % config.generator_every == 0:
             info |= update_generator(agent, generator, train, config.generator_batch_size, rng)

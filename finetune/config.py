@@ -1,0 +1,98 @@
+"""Every setting of fine-tuning and evaluation, each beside its meaning; free of torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pretrain.config import DeviceName, SubgoalConfig
+
+
+@dataclass(frozen=True)
+class OnlineConfig:
+    """Online fine-tuning."""
+
+    rounds: int = 40
+    worlds: int = 32
+    round_steps: int = 50
+    """Steps of every world in a round."""
+    updates: int = 300
+    """Updates of SAC in a round."""
+    batch_size: int = 256
+    offline_share: float = 0.5
+    """Share of each batch that comes from the dataset."""
+    lr: float = 3e-4
+    """Of SAC."""
+    cloning: float = 20.0
+    """Weight of cloning the actions that led to the goal."""
+    generator_every: int = 4
+    """Updates of SAC for one of the generator; 0 leaves the generator as it is."""
+    generator_batch_size: int = 256
+    generator_lr: float = 3e-4
+    replay_size: int = 1_000_000
+    """Rows kept of the worlds' trajectories (Table I: D)."""
+    evaluate_every: int = 5
+    """Rounds between evaluations, each followed by a checkpoint."""
+    evaluation_episodes: int = 100
+
+
+@dataclass(frozen=True)
+class PolicyConfig:
+    """A policy on the disk."""
+
+    path: Path | None = None
+    """A run, a checkpoint, or a folder with ``model.safetensors``."""
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """The dataset that fine-tuning goes on learning from."""
+
+    root: Path | None = None
+    """Its folder; that of the pretraining if left out."""
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """An environment from elsewhere."""
+
+    id: str | None = None
+    """A registered Gymnasium GoalEnv, for example FetchPickAndPlace-v4, or MODULE:ID. Without a
+    policy, learning starts from nothing, after some episodes of random actions."""
+
+
+@dataclass(frozen=True)
+class FinetuneConfig:
+    """Online fine-tuning."""
+
+    output_dir: Path
+    """Where the run goes."""
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    env: EnvConfig = field(default_factory=EnvConfig)
+    dataset: DataConfig = field(default_factory=DataConfig)
+    subgoals: SubgoalConfig = field(default_factory=SubgoalConfig)
+    online: OnlineConfig = field(default_factory=OnlineConfig)
+    seed: int = 0
+    device: DeviceName = "auto"
+    threads: int | None = None
+    """Threads of the networks on a processor; all cores if left out."""
+    resume: bool = False
+    """Go on from the newest checkpoint in the output folder."""
+
+
+@dataclass(frozen=True)
+class EvaluateConfig:
+    """Evaluation of a policy."""
+
+    policy: PolicyConfig
+    episodes: int = 500
+    seed: int = 1000
+    """Seed of the first episode; the others follow it."""
+    subgoals: SubgoalConfig = field(default_factory=SubgoalConfig)
+    json: bool = False
+    """Print JSON instead of a table."""
+    video: Path | None = None
+    """Film the first episode, with subgoals and goal drawn in, into this MP4 file."""
+    device: DeviceName = "auto"
+    threads: int | None = None
+    """Threads of the networks on a processor; all cores if left out."""

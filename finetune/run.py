@@ -1,0 +1,139 @@
+"""A fine-tuning run from its configuration: worlds, agent and dataset put together."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from eisp_data.config import from_plain, load_yaml
+from eisp_data.errors import ConfigError, DataError
+from eisp_data.sim.gym_worlds import GymWorlds
+from eisp_data.sim.worlds import Worlds
+from eisp_data.storage.cache import load_arrays
+from eisp_data.tasks.registry import TASKS
+from finetune.config import FinetuneConfig
+from finetune.train import Finetuner
+from pretrain import checkpoint
+from pretrain.agent import BANK, Agent
+from pretrain.config import PretrainConfig, SubgoalConfig
+from pretrain.device import describe, set_up
+from pretrain.layout import Layout
+from pretrain.presets import preset
+from pretrain.replay import Trajectories
+from pretrain.train import gather, prepare_run
+
+_FIRST_EPISODES = 100
+"""Episodes of random actions before learning from nothing."""
+
+
+def finetune(config: FinetuneConfig) -> dict[str, float]:
+    """Fine-tune an agent; return the summary that is also in ``summary.json`` of the run."""
+    run = config.output_dir
+    prepare_run(run, config, config.resume, "finetune.yaml")
+    device = set_up(config.device, config.threads)
+    print(describe(device), flush=True)
+    torch.manual_seed(config.seed)
+    if config.policy.path is None:
+        if config.env.id is None:
+            raise ConfigError("give --policy.path, a pretrained policy, or --env.id to start anew")
+        agent, data = _from_nothing(config.env.id, config.seed)
+    else:
+        agent = Agent.load(checkpoint.find_policy(config.policy.path))
+        data = _dataset(config, agent)
+        _keep_history(config.policy.path, run)
+    name = config.env.id or agent.config.task
+    if name != agent.config.task:
+        raise ConfigError(
+            f"{config.policy.path} is a policy of {agent.config.task!r}, not {name!r}"
+        )
+    agent.config = replace(agent.config, subgoals=config.subgoals)
+    finetuner = Finetuner(
+        run,
+        agent.to(device),
+        data,
+        lambda count: make_worlds(name, count),
+        config.online,
+        config.seed,
+        device,
+    )
+    summary = finetuner(config.resume)
+    (run / "summary.json").write_text(json.dumps(summary, indent=2))
+    return summary
+
+
+def make_worlds(name: str, count: int) -> Worlds | GymWorlds:
+    """Return worlds of a task, or of a registered GoalEnv."""
+    return Worlds(TASKS[name], count) if name in TASKS else GymWorlds(name, count)
+
+
+def load_for_rollouts(path: Path | None, subgoals: SubgoalConfig, device: str) -> Agent:
+    """Read a policy and set how it chooses its subgoals."""
+    if path is None:
+        raise ConfigError("missing --policy.path, the folder of a policy")
+    agent = Agent.load(checkpoint.find_policy(path), device)
+    agent.config = replace(agent.config, subgoals=subgoals)
+    return agent
+
+
+def saved_subgoals(path: Path) -> SubgoalConfig:
+    """Return how a policy on the disk chooses its subgoals; needs no torch."""
+    try:
+        plain = json.loads((checkpoint.find_policy(path) / "config.json").read_text())
+        return from_plain(SubgoalConfig, plain["agent"]["subgoals"])
+    except (OSError, ValueError, KeyError) as error:
+        raise DataError(f"{path} holds no readable policy: {error}") from None
+
+
+def _dataset(config: FinetuneConfig, agent: Agent) -> Trajectories:
+    """Return the training episodes of the dataset that the agent was pretrained on."""
+    root = config.dataset.root or _pretraining_dataset(config.policy.path)
+    arrays = load_arrays(root)
+    if arrays.spec.task != agent.config.task:
+        raise DataError(
+            f"{root} is a dataset of {arrays.spec.task!r}, the policy one of {agent.config.task!r}"
+        )
+    every = np.arange(arrays.num_episodes)
+    return gather(arrays, every, agent.layout, agent.config.waypoints)
+
+
+def _pretraining_dataset(path: Path | None) -> Path:
+    assert path is not None
+    for folder in (path, *path.resolve().parents):
+        if (folder / "pretrain.yaml").exists():
+            return load_yaml(PretrainConfig, folder / "pretrain.yaml").dataset.root
+    raise ConfigError(f"{path} does not say what it was pretrained on; give --dataset.root")
+
+
+def _keep_history(policy: Path, run: Path) -> None:
+    """Start the run's metrics with those of the pretraining, so that one curve shows both."""
+    for folder in (policy, *policy.resolve().parents):
+        history = folder / "metrics.jsonl"
+        if history.exists() and not (run / "metrics.jsonl").exists():
+            shutil.copy(history, run / "metrics.jsonl")
+            return
+
+
+def _from_nothing(env_id: str, seed: int) -> tuple[Agent, Trajectories]:
+    """Return a fresh agent for an environment, and episodes of random actions in it."""
+    worlds = GymWorlds(env_id, 1)
+    layout = Layout(worlds.observation_dim, worlds.goal_dim, worlds.action_dim)
+    data = Trajectories(layout, 10**9, None, purposeful=False)
+    rng = np.random.default_rng(seed)
+    rows = []
+    for episode in range(_FIRST_EPISODES):
+        worlds.reset([seed * _FIRST_EPISODES + episode])
+        for _ in range(worlds.episode_steps + 1):
+            action = rng.uniform(-1.0, 1.0, (1, layout.action_dim)).astype(np.float32)
+            rows.append((worlds.observation.copy(), worlds.achieved_goal.copy(), action))
+            worlds.step(action)
+    starts = np.arange(_FIRST_EPISODES + 1) * (worlds.episode_steps + 1)
+    observation, achieved, action = (np.concatenate(c) for c in zip(*rows, strict=True))
+    data.extend(observation, achieved, action, starts)
+    bank = achieved[rng.integers(len(achieved), size=BANK)]
+    config = preset("cpu", env_id, Path(), Path()).agent
+    return Agent(config, layout, data.moments(), torch.from_numpy(bank)), data
