@@ -9,6 +9,7 @@ import numpy as np
 
 from eisp_data.policies.registry import SCRIPTS
 from eisp_data.policies.script import Noise, ScriptedPolicy
+from eisp_data.sim.gym_worlds import AnyWorlds
 from eisp_data.sim.worlds import Worlds
 from eisp_data.tasks.registry import TASKS
 from finetune.rollout import SubgoalPolicy
@@ -73,13 +74,13 @@ class Evaluation:
 
 def evaluate(
     agent: Agent,
-    worlds: Worlds,
+    worlds: AnyWorlds,
     episodes: int,
     seed: int,
     *,
     oracle: float | None = None,
     device: str = "cpu",
-    watch: Callable[[Worlds, SubgoalPolicy], None] | None = None,
+    watch: Callable[[AnyWorlds, SubgoalPolicy], None] | None = None,
 ) -> Evaluation:
     """Run the policy without exploration.
 
@@ -125,10 +126,10 @@ def evaluate(
 
 def _batch(
     agent: Agent,
-    worlds: Worlds,
+    worlds: AnyWorlds,
     seed: int,
     device: str,
-    watch: Callable[[Worlds, SubgoalPolicy], None] | None,
+    watch: Callable[[AnyWorlds, SubgoalPolicy], None] | None,
 ) -> tuple[np.ndarray, ...]:
     worlds.reset(range(seed, seed + worlds.count))
     policy = SubgoalPolicy(agent, worlds.count, device)

@@ -10,21 +10,21 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from eisp_data.config import from_plain, load_yaml
+from eisp_data.config import load_yaml
 from eisp_data.errors import ConfigError, DataError
-from eisp_data.sim.gym_worlds import GymWorlds
+from eisp_data.sim.gym_worlds import AnyWorlds, GymWorlds
 from eisp_data.sim.worlds import Worlds
 from eisp_data.storage.cache import load_arrays
 from eisp_data.tasks.registry import TASKS
 from finetune.config import FinetuneConfig
 from finetune.train import Finetuner
-from pretrain import checkpoint
 from pretrain.agent import BANK, Agent
 from pretrain.config import PretrainConfig, SubgoalConfig
 from pretrain.device import describe, set_up
 from pretrain.layout import Layout
 from pretrain.presets import preset
 from pretrain.replay import Trajectories
+from pretrain.saved import find_policy
 from pretrain.train import gather, prepare_run
 
 _FIRST_EPISODES = 100
@@ -43,7 +43,7 @@ def finetune(config: FinetuneConfig) -> dict[str, float]:
             raise ConfigError("give --policy.path, a pretrained policy, or --env.id to start anew")
         agent, data = _from_nothing(config.env.id, config.seed)
     else:
-        agent = Agent.load(checkpoint.find_policy(config.policy.path))
+        agent = Agent.load(find_policy(config.policy.path))
         data = _dataset(config, agent)
         _keep_history(config.policy.path, run)
     name = config.env.id or agent.config.task
@@ -66,7 +66,7 @@ def finetune(config: FinetuneConfig) -> dict[str, float]:
     return summary
 
 
-def make_worlds(name: str, count: int) -> Worlds | GymWorlds:
+def make_worlds(name: str, count: int) -> AnyWorlds:
     """Return worlds of a task, or of a registered GoalEnv."""
     return Worlds(TASKS[name], count) if name in TASKS else GymWorlds(name, count)
 
@@ -75,18 +75,9 @@ def load_for_rollouts(path: Path | None, subgoals: SubgoalConfig, device: str) -
     """Read a policy and set how it chooses its subgoals."""
     if path is None:
         raise ConfigError("missing --policy.path, the folder of a policy")
-    agent = Agent.load(checkpoint.find_policy(path), device)
+    agent = Agent.load(find_policy(path), device)
     agent.config = replace(agent.config, subgoals=subgoals)
     return agent
-
-
-def saved_subgoals(path: Path) -> SubgoalConfig:
-    """Return how a policy on the disk chooses its subgoals; needs no torch."""
-    try:
-        plain = json.loads((checkpoint.find_policy(path) / "config.json").read_text())
-        return from_plain(SubgoalConfig, plain["agent"]["subgoals"])
-    except (OSError, ValueError, KeyError) as error:
-        raise DataError(f"{path} holds no readable policy: {error}") from None
 
 
 def _dataset(config: FinetuneConfig, agent: Agent) -> Trajectories:

@@ -18,7 +18,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from eisp_data.errors import ConfigError
-from eisp_data.sim.worlds import Worlds
+from eisp_data.sim.gym_worlds import AnyWorlds
 from finetune.config import OnlineConfig
 from finetune.evaluate import Evaluation, evaluate
 from finetune.rollout import SubgoalPolicy
@@ -27,6 +27,7 @@ from pretrain.agent import Agent
 from pretrain.metrics import MetricsLog
 from pretrain.replay import Trajectories
 from pretrain.sac import Batch, SacOptimizer
+from pretrain.saved import POLICY
 from pretrain.train import update_generator
 
 _SELECTION_SEED = 500_000_000
@@ -39,7 +40,7 @@ _TRAINING_SEED = 1_000_000_000
 class Rollouts:
     """Worlds that are being learned in, and how far each has come."""
 
-    worlds: Worlds
+    worlds: AnyWorlds
     policy: SubgoalPolicy
     next_seed: int
 
@@ -107,7 +108,7 @@ class Finetuner:
         run: Path,
         agent: Agent,
         offline: Trajectories,
-        make_worlds: Callable[[int], Worlds],
+        make_worlds: Callable[[int], AnyWorlds],
         config: OnlineConfig,
         seed: int,
         device: str,
@@ -194,7 +195,7 @@ class Finetuner:
         if point == max(
             (p for p in self._points()), key=lambda p: (p["success_last"], p["return"])
         ):
-            self.agent.save(self.run / "best" / checkpoint.POLICY)
+            self.agent.save(self.run / "best" / POLICY)
         self._spent = time.monotonic() - start
         values: dict[str, float | Tensor] = {f"train/{k}": v for k, v in info.items()}
         values |= {f"eval/{k}": v for k, v in point.items()}

@@ -22,8 +22,8 @@ from torch import Tensor
 
 from eisp_data.errors import DataError
 from pretrain.agent import Agent
+from pretrain.saved import POLICY
 
-POLICY = "pretrained_model"
 _STATE = "training_state"
 _KEPT = 2
 
@@ -105,16 +105,6 @@ def restore(
 def exists(run: Path) -> bool:
     """Return whether the run has a checkpoint."""
     return (run / "checkpoints" / "last" / _STATE / "state.json").exists()
-
-
-def find_policy(path: Path) -> Path:
-    """Return the folder of the policy for a path that names it, its checkpoint or its run."""
-    for candidate in (path, path / POLICY, path / "checkpoints" / "last" / POLICY):
-        if (candidate / "model.safetensors").exists():
-            return candidate
-    raise DataError(
-        f"{path} holds no policy; give a run, a checkpoint, or a folder with model.safetensors"
-    )
 
 
 def _flatten(optimizers: Mapping[str, torch.optim.Optimizer]) -> dict[str, Tensor]:

@@ -12,6 +12,7 @@ import numpy as np
 from gymnasium import spaces
 
 from eisp_data.errors import ConfigError
+from eisp_data.sim.worlds import Worlds
 
 _PARTS = ("observation", "achieved_goal", "desired_goal")
 _SUCCESS_KEYS = ("is_success", "success")
@@ -137,6 +138,9 @@ class GymWorlds:
         """Free the environments."""
         for env in self._envs:
             env.close()
+
+
+AnyWorlds = Worlds | GymWorlds
 
 
 def _make(env_id: str) -> gymnasium.Env[Any, Any]:

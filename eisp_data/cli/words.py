@@ -1,0 +1,45 @@
+"""A look at the words of a command line before they are parsed: where do its options start from?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from eisp_data.config import load_yaml
+from eisp_data.errors import ConfigError
+
+
+def take(words: Sequence[str], flag: str) -> tuple[list[str], str | None]:
+    """Take ``flag VALUE`` or ``flag=VALUE`` out of the words; None if it is not there."""
+    for index, word in enumerate(words):
+        name, equals, value = word.partition("=")
+        if name == flag:
+            if not equals and index + 1 == len(words):
+                raise ConfigError(f"{flag}: missing its value")
+            rest = [*words[:index], *words[index + (1 if equals else 2) :]]
+            return rest, value if equals else words[index + 1]
+    return list(words), None
+
+
+def given(words: Sequence[str], flag: str) -> bool:
+    """Return whether the flag is among the words, with or without a value."""
+    return any(word.partition("=")[0] == flag for word in words)
+
+
+def saved_run[T](words: Sequence[str], kind: type[T], name: str) -> T | None:
+    """Return the configuration that ``--resume`` goes on with, from the ``--output-dir``.
+
+    Returns:
+        None without ``--resume``.
+
+    Raises:
+        ConfigError: there is no such run.
+    """
+    if not given(words, "--resume"):
+        return None
+    _, folder = take(words, "--output-dir")
+    if folder is None:
+        raise ConfigError("--resume: give --output-dir, the run to go on with")
+    if not (Path(folder) / name).exists():
+        raise ConfigError(f"--resume: {folder} holds no run, {name} is missing")
+    return load_yaml(kind, Path(folder) / name)

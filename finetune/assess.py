@@ -1,0 +1,39 @@
+"""An evaluation from its configuration, and a film of its first episode."""
+
+from __future__ import annotations
+
+from eisp_data.errors import ConfigError
+from eisp_data.tasks.registry import TASKS
+from finetune.config import EvaluateConfig
+from finetune.evaluate import Evaluation, evaluate, oracle_return
+from finetune.run import load_for_rollouts, make_worlds
+from finetune.video import Film
+from pretrain.device import set_up
+
+_ORACLE_EPISODES = 100
+_BATCH = 100
+
+
+def assess(config: EvaluateConfig) -> Evaluation:
+    """Evaluate a policy, and film its first episode if asked to."""
+    if config.episodes < 1:
+        raise ConfigError(f"--episodes {config.episodes}: at least one is needed")
+    device = set_up(config.device, config.threads)
+    agent = load_for_rollouts(config.policy.path, config.subgoals, device)
+    name = agent.config.task
+    if config.video and name not in TASKS:
+        raise ConfigError(f"--video: only our own tasks are drawn, not {name!r}")
+    film = Film()
+    result = evaluate(
+        agent,
+        make_worlds(name, min(_BATCH, config.episodes)),
+        config.episodes,
+        config.seed,
+        oracle=oracle_return(name, min(_ORACLE_EPISODES, config.episodes), config.seed),
+        device=device,
+        watch=film if config.video else None,
+    )
+    if config.video:
+        config.video.parent.mkdir(parents=True, exist_ok=True)
+        film.write(config.video)
+    return result

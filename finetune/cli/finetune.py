@@ -1,0 +1,47 @@
+"""``eisp-finetune``: learn online, with subgoals, in simulated worlds."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from eisp_data.cli.run import fail, run
+from eisp_data.cli.words import given, saved_run, take
+from eisp_data.errors import EispError
+from finetune.config import FinetuneConfig
+from pretrain.saved import saved_subgoals
+
+
+def main() -> None:
+    """Run the command."""
+    try:
+        default = _start(sys.argv[1:])
+    except EispError as error:
+        fail(str(error))
+    run(_command, None, "eisp-finetune", config_file=True, default=default)
+
+
+def _command(config: FinetuneConfig) -> None:
+    """Fine-tune a pretrained policy online, with subgoals.
+
+    --subgoals.source random and --subgoals.source none show what the subgoals are worth.
+    """
+    from finetune.run import finetune
+
+    summary = finetune(config)
+    print(
+        f"success before {summary['offline_success']:.2f}, best {summary['best_success']:.2f}; "
+        f"deepest dip {summary['dip']:.2f}, recovered after {summary['recovery_steps']:.0f} steps"
+    )
+    print(f"policy: {config.output_dir / 'best'}")
+
+
+def _start(words: list[str]) -> FinetuneConfig | None:
+    saved = saved_run(words, FinetuneConfig, "finetune.yaml")
+    if saved or given(words, "--config"):
+        return saved
+    _, path = take(words, "--policy.path")
+    folder = Path("runs/finetune")
+    if path is None:
+        return FinetuneConfig(folder)
+    return FinetuneConfig(folder, subgoals=saved_subgoals(Path(path)))
