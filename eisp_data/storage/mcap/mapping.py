@@ -47,6 +47,16 @@ FIELDS = {
 IMAGE, EXTRA = "observation.images.", "extra."
 
 
+def check_role(topic: str, role: str) -> None:
+    """Raise ConfigError unless ``role`` is one that a channel can have."""
+    named = any(role.startswith(front) and role != front for front in (IMAGE, EXTRA))
+    if role not in ROLES and not named:
+        raise ConfigError(
+            f"{topic}: to: {role!r}; choose one of {', '.join(ROLES)}, "
+            f"{IMAGE}<camera>, {EXTRA}<column>"
+        )
+
+
 @dataclass(frozen=True, kw_only=True)
 class StreamMap:
     """One channel, or a part of it, and the column that it becomes."""
@@ -82,20 +92,14 @@ class StreamMap:
     0 keeps them, with the age in its column."""
 
     def __post_init__(self) -> None:
-        image = self.to.startswith(IMAGE)
-        named = any(self.to.startswith(front) and self.to != front for front in (IMAGE, EXTRA))
-        if self.to not in ROLES and not named:
-            raise ConfigError(
-                f"{self.topic}: to: {self.to!r}; choose one of {', '.join(ROLES)}, "
-                f"{IMAGE}<camera>, {EXTRA}<column>"
-            )
+        check_role(self.topic, self.to)
         if self.via and not (self.parent and self.frame):
             raise ConfigError(f"{self.topic}: via needs both parent and frame")
         if self.rule not in ("", *RULES):
             raise ConfigError(
                 f"{self.topic}: rule: {self.rule!r}; choose one of {', '.join(RULES)}"
             )
-        if image and self.rule == "interpolate":
+        if self.camera is not None and self.rule == "interpolate":
             raise ConfigError(f"{self.topic}: images cannot be interpolated; hold or nearest")
         known = sorted({name for names in FIELDS.values() for name in names})
         for name in self.fields:

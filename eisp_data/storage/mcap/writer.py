@@ -25,6 +25,7 @@ from mcap.writer import CompressionType, Writer
 from eisp_data.errors import ConfigError, DataError
 from eisp_data.storage.mcap import messages
 from eisp_data.storage.mcap.backlog import Backlog, Item
+from eisp_data.storage.mcap.mapping import check_role
 
 COMPRESSIONS = {
     "zstd": CompressionType.ZSTD,
@@ -232,6 +233,8 @@ class McapWriter:
         role: str | None,
     ) -> bool:
         self._raise()
+        if role is not None and topic not in self._kinds:
+            check_role(topic, role)
         known = self._kinds.setdefault(topic, (kind, role))[0]
         if known is not kind:
             name, other = known.DESCRIPTOR.full_name, kind.DESCRIPTOR.full_name

@@ -174,6 +174,8 @@ def test_bad_calls_are_refused_where_they_are_made(tmp_path: Path) -> None:
             writer.event("lunch")
         with pytest.raises(DataError, match="outcome 'maybe'"):
             writer.event("episode_end", outcome="maybe")
+        with pytest.raises(ConfigError, match="'acton'; choose one of"):
+            writer.vector("/y", [1.0], role="acton")
         with pytest.raises(DataError, match="2 names but 1"):
             writer.log("/j", messages.joints(["a", "b"], [1.0], 0))
     assert writer.stats().written == {"/x": 1}
