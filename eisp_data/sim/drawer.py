@@ -36,8 +36,9 @@ PATH_HALF_WIDTH_M = 0.080
 KERB_M = 0.165
 """The kerb's face: no finger comes so near to the robot, and the open bar just does not touch."""
 
-_WOOD, _FRONT, _HANDLE, _GLASS = (
+_WOOD, _FRONT, _HANDLE, _GLASS, _CLEAR = (
     "0.62 0.47 0.34 1", "0.93 0.90 0.85 1", "0.13 0.50 0.80 1", "0.75 0.85 0.90 0.25",
+    "0.62 0.47 0.34 0.4",
 )  # fmt: skip
 _BUFFER = 'friction="0.2 0.01 0.0001" solref="0.014 1" priority="1"'
 """Of bar and kerb: hard and rough ones toss up the block that they catch between them."""
@@ -84,7 +85,7 @@ def _cabinet() -> str:
         _box((front, -0.089, 0.0), (back, -0.079, 0.072), _WOOD),
         _box((back, -0.089, 0.0), (back + 0.01, 0.089, 0.072), _WOOD),
         _box((front, -0.089, 0.072), (back + 0.01, 0.089, 0.082), _GLASS, "cabinet"),
-        _box((KERB_M - 0.015, -0.10, 0.0), (KERB_M, 0.10, 0.060), _WOOD, "kerb", _BUFFER),
+        _box((KERB_M - 0.015, -0.10, 0.0), (KERB_M, 0.10, 0.060), _CLEAR, "kerb", _BUFFER),
     ]
     return "\n".join(boxes)
 
