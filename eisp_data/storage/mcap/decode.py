@@ -6,6 +6,8 @@ anything: every failure becomes a DataError that names the channel and the type.
 
 from __future__ import annotations
 
+import contextlib
+import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -131,7 +133,9 @@ def _ros_parser(channel: Channel, schema: Schema) -> Callable[[bytes], Any]:
     from mcap_ros2.decoder import DecoderFactory
 
     try:
-        parse = DecoderFactory().decoder_for("cdr", schema)
+        # Besides raising, the library prints several lines of its own.
+        with contextlib.redirect_stderr(io.StringIO()):
+            parse = DecoderFactory().decoder_for("cdr", schema)
     except Exception as error:  # A foreign text, parsed by a library that raises anything.
         text = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise DataError(f"{channel.topic}: bad definition of {schema.name} ({text})") from None

@@ -312,7 +312,9 @@ def test_messages_with_flipped_bits_decode_or_are_refused_in_one_line(bag: Path)
     assert refused > 50
 
 
-def test_a_definition_that_is_damaged_is_refused_in_one_line(bag: Path) -> None:
+def test_a_definition_that_is_damaged_is_refused_in_one_line(
+    bag: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (path,) = bag.glob("*.mcap")
     rng = np.random.default_rng(6)
     with McapLog(path) as log:
@@ -329,3 +331,4 @@ def test_a_definition_that_is_damaged_is_refused_in_one_line(bag: Path) -> None:
                     decode.Decoder().decode(channel, bad, message.data)
                 except DataError as error:
                     assert "\n" not in str(error)
+    assert capsys.readouterr() == ("", "")
