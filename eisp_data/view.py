@@ -1,0 +1,135 @@
+"""An episode to look at: a storyboard, a film, a Rerun recording, with goal and subgoal."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from eisp_data.episode import Episode
+from eisp_data.errors import ConfigError, DataError
+from eisp_data.replay import SOFT_SHADOW, chosen_episodes, light, task_of
+from eisp_data.sim.render import Renderer
+from eisp_data.storage.lerobot import DatasetSpec, read_spec
+from eisp_data.storage.video import encode_video
+
+STORY_FRAMES = 6
+MARGIN = 4
+
+
+def waypoints(steps: int, parts: int) -> np.ndarray:
+    """Return (T + 1,) int64: for each observation, where the current subgoal was achieved.
+
+    The trajectory is cut into ``parts`` equal parts; at t the subgoal is the end of the part that
+    t is in. Worked example: 6 steps in 3 parts end at 2, 4 and 6, so
+    ``waypoints(6, 3) == [2, 2, 4, 4, 6, 6, 6]``.
+    """
+    ends = np.round(np.arange(1, parts + 1) * steps / parts).astype(np.int64)
+    return ends[np.minimum(np.searchsorted(ends, np.arange(steps + 1), side="right"), parts - 1)]
+
+
+def draw(
+    spec: DatasetSpec, episode: Episode, camera: str = "front", width: int = 480, height: int = 360
+) -> np.ndarray:
+    """Return (T + 1, H, W, 3) uint8: every state with its goal and current subgoal drawn in.
+
+    The subgoal is in hindsight: the next waypoint that the trajectory itself reaches.
+    """
+    task = task_of(spec.task, spec.sim_state_dim)
+    target = waypoints(len(episode), task.paper.waypoints)
+    with (
+        light(task, SOFT_SHADOW, samples=4),
+        Renderer(task, camera, width, height) as renderer,
+    ):
+        return np.stack(
+            [
+                renderer.render(state, episode.desired_goal, episode.achieved_goal[target[row]])
+                for row, state in enumerate(episode.sim_state)
+            ]
+        )
+
+
+def view(
+    root: Path, to: Path, number: int = 0, camera: str = "", rerun: bool = False
+) -> list[Path]:
+    """Write ``episode-N.png``, ``episode-N.mp4`` and, if wished, ``episode-N.rrd`` into ``to``.
+
+    Args:
+        root: the dataset.
+        to: folder for the files, made if missing.
+        number: which episode.
+        camera: of the scene if the dataset has simulator states, else one of its own; the first
+            one there is if left out.
+        rerun: write the Rerun recording too; needs the package ``rerun-sdk``.
+
+    Returns:
+        The files.
+    """
+    if rerun:
+        _need_rerun()
+    spec = read_spec(root)
+    simulated = spec.sim_state_dim > 0
+    [(_, episode)] = chosen_episodes(root, [number], images=not simulated)
+    if simulated:
+        frames = draw(spec, episode, camera or "front")
+    else:
+        name = camera or next(iter(spec.cameras), "")
+        if name not in episode.images:
+            raise DataError(f"{root}: no camera {name!r}; there are {sorted(spec.cameras)}")
+        frames = episode.images[name]
+    to.mkdir(parents=True, exist_ok=True)
+    stem = to / f"episode-{number}"
+    written = [stem.with_suffix(".png"), stem.with_suffix(".mp4")]
+    _save_png(storyboard(frames), written[0])
+    encode_video(written[1], frames, spec.fps)
+    if rerun:
+        written.append(stem.with_suffix(".rrd"))
+        _save_rerun(written[2], spec, episode, frames)
+    return written
+
+
+def storyboard(frames: np.ndarray, count: int = STORY_FRAMES) -> np.ndarray:
+    """Return some (T, H, W, 3) frames, evenly spaced, in two rows of one picture."""
+    rows = np.linspace(0, len(frames) - 1, count).round().astype(int)
+    _, height, width, _ = frames.shape
+    across = -(-count // 2)
+    size = (2 * (height + MARGIN) - MARGIN, across * (width + MARGIN) - MARGIN, 3)
+    page = np.full(size, 255, np.uint8)
+    for place, row in enumerate(rows):
+        top, left = place // across * (height + MARGIN), place % across * (width + MARGIN)
+        page[top : top + height, left : left + width] = frames[row]
+    return page
+
+
+def _save_png(pixels: np.ndarray, path: Path) -> None:
+    from PIL import Image
+
+    Image.fromarray(pixels).save(path, optimize=True)
+
+
+def _need_rerun() -> None:
+    try:
+        import rerun  # noqa: F401
+    except ImportError:
+        raise ConfigError("--rerun needs the package rerun-sdk: pip install rerun-sdk") from None
+
+
+def _save_rerun(path: Path, spec: DatasetSpec, episode: Episode, frames: np.ndarray) -> None:
+    """Write images, goal, achieved goal, actions and reward along the time of the episode."""
+    import rerun
+
+    recording = rerun.RecordingStream("eisp")
+    recording.save(path)
+    objects = -1, 3 if spec.goal_dim % 3 == 0 else spec.goal_dim
+    for row in range(len(episode) + 1):
+        recording.set_time("time", duration=row / spec.fps)
+        recording.log("camera", rerun.Image(frames[row]).compress(90))
+        if objects[1] == 3:
+            achieved = episode.achieved_goal[row].reshape(objects)
+            desired = episode.desired_goal.reshape(objects)
+            recording.log("achieved_goal", rerun.Points3D(achieved, radii=0.02))
+            recording.log("desired_goal", rerun.Points3D(desired, radii=0.02))
+        if row < len(episode):
+            recording.log("action", rerun.Scalars(episode.action[row].astype(np.float64)))
+            recording.log("reward", rerun.Scalars(float(episode.reward[row])))
+    recording.flush()
