@@ -149,7 +149,7 @@ class _Frame:
             f'<line x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{y:.1f}" y2="{y:.1f}" '
             f'stroke="{level.colour}" stroke-width="1.5" stroke-dasharray="5 4"/>'
             f'<text class="label" x="{_WIDTH - _RIGHT - 4}" y="{y - 4:.1f}" text-anchor="end" '
-            f'fill="{level.colour}">{escape(level.name)}</text>'
+            f'style="fill:{level.colour}">{escape(level.name)}</text>'
         )
 
     def region(self, region: Region) -> str:
@@ -157,8 +157,8 @@ class _Frame:
         text = ""
         if right - left > 6 * len(region.name):  # else it would run into its neighbour
             text = (
-                f'<text class="label" x="{(left + right) / 2:.1f}" y="{_TOP + 12}" '
-                f'text-anchor="middle" fill="#64748b">{escape(region.name)}</text>'
+                f'<text class="label" x="{(left + right) / 2:.1f}" y="{_HEIGHT - _BOTTOM - 8}" '
+                f'text-anchor="middle">{escape(region.name)}</text>'
             )
         return (
             f'<rect x="{left:.1f}" y="{_TOP}" width="{right - left:.1f}" '

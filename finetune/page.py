@@ -25,16 +25,18 @@ p { margin: 6px 0 12px; color: var(--soft); max-width: 76ch; }
 table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
 th, td { padding: 8px 12px; text-align: right; border-bottom: 1px solid var(--line); }
 th { font-weight: 600; font-size: 13.5px; color: var(--soft); }
+td { white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; }
 tbody tr:last-child td { border-bottom: 0; }
 tr.strong td { font-weight: 650; }
 small { color: var(--soft); font-weight: 400; }
-.pair { display: grid; grid-template-columns: repeat(auto-fit, minmax(400px, 1fr)); gap: 14px; }
+.pair { display: grid; gap: 14px;
+  grid-template-columns: repeat(auto-fill, minmax(min(100%, 420px), 1fr)); }
 svg { width: 100%; height: auto; display: block; }
 svg text { font-size: 11px; fill: #475569; }
 svg .title { font-size: 13px; font-weight: 600; fill: #0f172a; }
 svg .axis { font-size: 12px; }
-svg .label { fill: inherit; paint-order: stroke; stroke: #fff; stroke-width: 3px; }
+svg .label { paint-order: stroke; stroke: #fff; stroke-width: 3px; }
 svg .grid { stroke: #e2e8f0; stroke-width: 1; }
 video { width: 100%; max-width: 640px; border-radius: 8px; display: block; background: #000; }
 .key i { display: inline-block; width: 11px; height: 11px; border-radius: 3px;

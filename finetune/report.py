@@ -17,6 +17,7 @@ from typing import Any
 from eisp_data.errors import ConfigError, DataError
 from finetune import page
 from finetune.charts import Level, Region, Series, bar_chart, line_chart
+from finetune.video import middle_frame
 
 REPORT = "report.html"
 _LEAD = (
@@ -202,11 +203,15 @@ def _video(run: Run) -> str:
     if run.video is None:
         return page.section("An episode", "No film of an episode was made in this run.")
     data = base64.b64encode(run.video).decode()
+    poster = base64.b64encode(middle_frame(run.video)).decode()
     text = (
         "Translucent cubes show the subgoal that the policy is heading for, small spheres the goal "
         "of the episode, both in the colours of the objects. It runs at twice the robot's speed."
     )
-    film = f'<video controls muted loop playsinline src="data:video/mp4;base64,{data}"></video>'
+    film = (
+        f'<video controls muted loop playsinline poster="data:image/jpeg;base64,{poster}" '
+        f'src="data:video/mp4;base64,{data}"></video>'
+    )
     return page.section("An episode", text, film)
 
 

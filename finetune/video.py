@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+
+from eisp_data.errors import DataError
 
 if TYPE_CHECKING:
     from eisp_data.sim.gym_worlds import AnyWorlds
@@ -45,6 +48,20 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: int) -> int:
         if stream is not None:
             container.mux(stream.encode())
     return count
+
+
+def middle_frame(video: bytes) -> bytes:
+    """Return the frame half way through an MP4 as a JPEG; DataError if it cannot be decoded."""
+    import av
+
+    try:
+        with av.open(io.BytesIO(video), "r") as container:
+            frames = list(container.decode(video=0))
+        picture = io.BytesIO()
+        frames[len(frames) // 2].to_image().save(picture, "JPEG", quality=85)
+    except (OSError, ValueError, IndexError) as error:
+        raise DataError(f"episode.mp4 cannot be decoded ({error})") from None
+    return picture.getvalue()
 
 
 class Film:
