@@ -134,7 +134,7 @@ def _batch(
     worlds.reset(range(seed, seed + worlds.count))
     policy = SubgoalPolicy(agent, worlds.count, device)
     returns = np.zeros(worlds.count)
-    some = worlds.success
+    some = worlds.success.copy()
     for _ in range(worlds.episode_steps):
         action = policy.act(
             worlds.observation, worlds.achieved_goal, worlds.desired_goal, explore=False
@@ -145,7 +145,9 @@ def _batch(
         if watch:
             watch(worlds, policy)
     distance = np.linalg.norm(worlds.achieved_goal - policy.subgoal, axis=1)
-    return worlds.success, worlds.success & worlds.settled, some, returns, distance
+    # Copied, because foreign worlds overwrite what they have shown.
+    last = worlds.success.copy()
+    return last, last & worlds.settled, some, returns, distance
 
 
 def oracle_return(name: str, episodes: int, seed: int) -> float | None:

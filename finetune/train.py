@@ -55,21 +55,24 @@ class Rollouts:
         """Step all worlds, exploring; then start anew those that are over or have succeeded.
 
         Returns:
-            Observations, achieved goals and actions (N * (steps + 1), ...), world after world,
-            and the (N + 1,) starts of the worlds' trajectories.
+            Observations, achieved goals and actions (R, ...), world after world, and the (N + 1,)
+            starts of the worlds' trajectories: each steps + 1 rows, less where a world ended.
         """
         worlds = self.worlds
         rows: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        lengths = np.ones(worlds.count, np.int64)
         for _ in range(steps):
-            observation, achieved = worlds.observation, worlds.achieved_goal
+            # Foreign worlds overwrite what they have shown.
+            observation, achieved = worlds.observation.copy(), worlds.achieved_goal.copy()
             action = self.policy.act(observation, achieved, worlds.desired_goal, explore=True)
             rows.append((observation, achieved, action))
+            lengths += ~(worlds.done | worlds.truncated)
             worlds.step(action)
-        rows.append((worlds.observation, worlds.achieved_goal, np.zeros_like(action)))
-        columns = [np.stack(column, 1) for column in zip(*rows, strict=True)]
+        last = worlds.observation.copy(), worlds.achieved_goal.copy(), np.zeros_like(action)
+        lived = np.arange(steps + 1) < lengths[:, None]
+        columns = [np.stack(column, 1)[lived] for column in zip(*rows, last, strict=True)]
         self.start(np.flatnonzero(worlds.truncated | worlds.done | worlds.success))
-        starts = np.arange(worlds.count + 1) * (steps + 1)
-        return *(c.reshape(-1, c.shape[-1]) for c in columns), starts
+        return *columns, np.concatenate([[0], np.cumsum(lengths)])
 
     def state(self) -> dict[str, np.ndarray]:
         """Return what ``restore`` needs."""
