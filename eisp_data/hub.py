@@ -19,9 +19,9 @@ from typing import Any, Literal
 from eisp_data.errors import ConfigError, DataError
 from eisp_data.storage.card import CITATION, PREVIEW, dataset_card
 from eisp_data.storage.files import one_line
-from eisp_data.storage.preview import preview_png
 from eisp_data.storage.schema import CODEBASE_VERSION
 from eisp_data.storage.validate import validate
+from eisp_data.view import preview_png
 
 Kind = Literal["dataset", "recording", "policy"]
 DATASET_FOLDERS = ("data", "meta", "videos")
@@ -280,9 +280,7 @@ def _one_line_errors(what: str) -> Iterator[None]:
     try:
         yield
     except (RepositoryNotFoundError, RevisionNotFoundError, EntryNotFoundError) as error:
-        raise DataError(
-            f"{what}: not found or not visible ({one_line(error)})"
-        ) from None
+        raise DataError(f"{what}: not found or not visible ({one_line(error)})") from None
     except HfHubHTTPError as error:
         raise DataError(f"{what}: the Hub refused ({one_line(error)})") from None
     except OfflineModeIsEnabled:

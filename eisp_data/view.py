@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import io
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from eisp_data.episode import Episode
-from eisp_data.errors import ConfigError, DataError
+from eisp_data.errors import ConfigError, DataError, EispError
 from eisp_data.replay import SOFT_SHADOW, chosen_episodes, light, task_of
 from eisp_data.sim.render import Renderer
 from eisp_data.storage.lerobot import DatasetSpec, read_spec
+from eisp_data.storage.preview import preview_png as plain_preview_png
 from eisp_data.storage.video import encode_video
 
 STORY_FRAMES = 6
 MARGIN = 4
+SIZE = (480, 360)
+"""Width and height of a drawn frame, pixels."""
 
 
 def waypoints(steps: int, parts: int) -> np.ndarray:
@@ -29,24 +35,45 @@ def waypoints(steps: int, parts: int) -> np.ndarray:
 
 
 def draw(
-    spec: DatasetSpec, episode: Episode, camera: str = "front", width: int = 480, height: int = 360
+    spec: DatasetSpec, episode: Episode, rows: Sequence[int] | None = None, camera: str = "front"
 ) -> np.ndarray:
-    """Return (T + 1, H, W, 3) uint8: every state with its goal and current subgoal drawn in.
+    """Return (N, H, W, 3) uint8: states with the goal and the current subgoal drawn in.
 
     The subgoal is in hindsight: the next waypoint that the trajectory itself reaches.
+
+    Args:
+        spec: the dataset's.
+        episode: with simulator states.
+        rows: which of its T + 1 states; all if None.
+        camera: of the scene.
     """
     task = task_of(spec.task, spec.sim_state_dim)
     target = waypoints(len(episode), task.paper.waypoints)
-    with (
-        light(task, SOFT_SHADOW, samples=4),
-        Renderer(task, camera, width, height) as renderer,
-    ):
+    chosen = range(len(episode) + 1) if rows is None else rows
+    with light(task, SOFT_SHADOW, samples=4), Renderer(task, camera, *SIZE) as renderer:
         return np.stack(
             [
-                renderer.render(state, episode.desired_goal, episode.achieved_goal[target[row]])
-                for row, state in enumerate(episode.sim_state)
+                renderer.render(
+                    episode.sim_state[row],
+                    episode.desired_goal,
+                    episode.achieved_goal[target[row]],
+                )
+                for row in chosen
             ]
         )
+
+
+def preview_png(root: Path) -> bytes:
+    """Return a storyboard of the first episode; without a simulator, what the data itself show."""
+    spec = read_spec(root)
+    try:
+        [(_, episode)] = chosen_episodes(root, [0])
+        frames = draw(spec, episode, story_rows(len(episode) + 1))
+    except EispError:  # a real robot, an unknown task, or no OpenGL here
+        return plain_preview_png(root)
+    buffer = io.BytesIO()
+    Image.fromarray(storyboard(frames)[::2, ::2]).save(buffer, "PNG", optimize=True)
+    return buffer.getvalue()
 
 
 def view(
@@ -71,7 +98,7 @@ def view(
     simulated = spec.sim_state_dim > 0
     [(_, episode)] = chosen_episodes(root, [number], images=not simulated)
     if simulated:
-        frames = draw(spec, episode, camera or "front")
+        frames = draw(spec, episode, camera=camera or "front")
     else:
         name = camera or next(iter(spec.cameras), "")
         if name not in episode.images:
@@ -80,7 +107,7 @@ def view(
     to.mkdir(parents=True, exist_ok=True)
     stem = to / f"episode-{number}"
     written = [stem.with_suffix(".png"), stem.with_suffix(".mp4")]
-    _save_png(storyboard(frames), written[0])
+    Image.fromarray(storyboard(frames)).save(written[0], optimize=True)
     encode_video(written[1], frames, spec.fps)
     if rerun:
         written.append(stem.with_suffix(".rrd"))
@@ -88,9 +115,14 @@ def view(
     return written
 
 
+def story_rows(length: int, count: int = STORY_FRAMES) -> list[int]:
+    """Return ``count`` rows of ``length``, evenly spaced, the first and the last among them."""
+    return [int(row) for row in np.linspace(0, length - 1, count).round()]
+
+
 def storyboard(frames: np.ndarray, count: int = STORY_FRAMES) -> np.ndarray:
     """Return some (T, H, W, 3) frames, evenly spaced, in two rows of one picture."""
-    rows = np.linspace(0, len(frames) - 1, count).round().astype(int)
+    rows = story_rows(len(frames), count)
     _, height, width, _ = frames.shape
     across = -(-count // 2)
     size = (2 * (height + MARGIN) - MARGIN, across * (width + MARGIN) - MARGIN, 3)
@@ -99,12 +131,6 @@ def storyboard(frames: np.ndarray, count: int = STORY_FRAMES) -> np.ndarray:
         top, left = place // across * (height + MARGIN), place % across * (width + MARGIN)
         page[top : top + height, left : left + width] = frames[row]
     return page
-
-
-def _save_png(pixels: np.ndarray, path: Path) -> None:
-    from PIL import Image
-
-    Image.fromarray(pixels).save(path, optimize=True)
 
 
 def _need_rerun() -> None:

@@ -12,7 +12,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ import numpy as np
 from eisp_data.episode import Scalar
 from eisp_data.errors import DataError
 from eisp_data.storage.episodes import read_index
-from eisp_data.storage.reader import Block, read_blocks, read_spec
+from eisp_data.storage.reader import Block, read_blocks, read_episodes, read_spec
 from eisp_data.storage.schema import SIM_STATE_COLUMN
 from eisp_data.storage.spec import DatasetSpec
 
@@ -81,15 +81,19 @@ ARRAYS = tuple(name for name in DatasetArrays.__dataclass_fields__ if name not i
 
 
 def fingerprint(root: Path | str) -> str:
-    """Return a key that changes when rows do: names, sizes, times and footers of all parquet.
+    """Return a key that changes when data do: names, sizes, times and last bytes of all files.
 
     Reading the data itself would cost as much as building the cache; a footer holds the extremes
     of every column of every episode.
     """
     root = Path(root)
     digest = hashlib.sha256(f"layout {LAYOUT}".encode())
-    paths = [*root.glob("data/chunk-*/*.parquet"), *root.glob("meta/episodes/chunk-*/*.parquet")]
-    for path in sorted(paths):
+    folders = (
+        "data/chunk-*/*.parquet",
+        "meta/episodes/chunk-*/*.parquet",
+        "videos/*/chunk-*/*.mp4",
+    )
+    for path in sorted(path for pattern in folders for path in root.glob(pattern)):
         status = path.stat()
         name = path.relative_to(root).as_posix()
         digest.update(f"{name} {status.st_size} {status.st_mtime_ns}\n".encode())
@@ -107,16 +111,48 @@ def load_arrays(root: Path | str) -> DatasetArrays:
     """
     root = Path(root)
     spec = read_spec(root)
+    return cached(root, "", lambda f: _fill(root, spec, f), lambda f: _open(f, spec))
+
+
+def load_images(root: Path | str, camera: str) -> np.ndarray:
+    """Return the (R, H, W, 3) uint8 frames of a camera, mapped; its rows are those of the arrays.
+
+    Raises:
+        DataError: no such camera, or a video is damaged.
+    """
+    root = Path(root)
+    spec = read_spec(root)
+    if camera not in spec.cameras:
+        known = ", ".join(spec.cameras) or "no cameras"
+        raise DataError(f"{root}: no camera {camera!r}; there are {known}")
+    return cached(
+        root,
+        f"-{camera}",
+        lambda f: _fill_images(root, camera, f),
+        lambda f: np.load(f / "images.npy", mmap_mode="r"),
+    )
+
+
+def cached[T](root: Path, part: str, fill: Callable[[Path], None], open_: Callable[[Path], T]) -> T:
+    """Return what ``open_`` reads from a part of a dataset's cache, filled first where needed.
+
+    Args:
+        root: the dataset.
+        part: end of the name of the cache's folder.
+        fill: writes the part into a folder.
+        open_: reads it from one.
+    """
     # Another process may drop the cache that this one is about to open, having seen newer data.
     for _ in range(3):
-        folder = _folder(root) / fingerprint(root)
+        key = fingerprint(root)
+        folder = _folder(root) / f"{key}{part}"
         if not (folder / "done").exists():
-            _build(root, spec, folder)
+            _build(fill, folder, key)
         try:
-            return _open(folder, spec)
+            return open_(folder)
         except FileNotFoundError:
             continue
-    raise DataError(f"{root}: changes faster than its array cache can be built")
+    raise DataError(f"{root}: changes faster than its cache can be built")
 
 
 def _folder(root: Path) -> Path:
@@ -138,10 +174,10 @@ def _folder(root: Path) -> Path:
     )
 
 
-def _build(root: Path, spec: DatasetSpec, folder: Path) -> None:
+def _build(fill: Callable[[Path], None], folder: Path, key: str) -> None:
     temporary = Path(tempfile.mkdtemp(prefix=".building-", dir=folder.parent))
     try:
-        _fill(root, spec, temporary)
+        fill(temporary)
         (temporary / "done").touch()
         try:
             os.rename(temporary, folder)
@@ -149,7 +185,7 @@ def _build(root: Path, spec: DatasetSpec, folder: Path) -> None:
             if not (folder / "done").exists():  # else another process was first: use its work
                 raise
         for other in folder.parent.iterdir():
-            if other != folder and not other.name.startswith("."):
+            if not other.name.startswith((".", key)):
                 shutil.rmtree(other, ignore_errors=True)
     except OSError as error:
         raise DataError(f"{folder.parent}: cannot write the array cache ({error})") from error
@@ -224,6 +260,18 @@ def _fill_block(out: dict[str, np.ndarray], block: Block, starts: np.ndarray) ->
     goals = wide("observation.desired_goal")[block.starts[:-1]]
     out["desired_goal"][first : first + count] = goals
     out["seed"][first : first + count] = [s.seed for s in sidecars]
+
+
+def _fill_images(root: Path, camera: str, folder: Path) -> None:
+    spec, index = read_spec(root), read_index(root)
+    rows = int((index.length + 1).sum())
+    shape = (rows, *spec.cameras[camera], 3)
+    out = np.lib.format.open_memmap(folder / "images.npy", "w+", np.uint8, shape)
+    row = 0
+    for episode in read_episodes(root, images=True):
+        out[row : row + len(episode) + 1] = episode.images[camera]
+        row += len(episode) + 1
+    out.flush()
 
 
 def _open(folder: Path, spec: DatasetSpec) -> DatasetArrays:

@@ -19,13 +19,16 @@ CITATION = """@misc{eisp,
 PREVIEW = "preview.png"
 
 
-def dataset_card(root: Path, license_name: str, citation: str = CITATION) -> str:
+def dataset_card(
+    root: Path, license_name: str, citation: str = CITATION, preview: str = PREVIEW
+) -> str:
     """Return the card of a dataset in Markdown, with the metadata block that Hubs read.
 
     Args:
         root: the dataset.
         license_name: identifier of the licence as Hubs know it, for example ``apache-2.0``.
         citation: BibTeX.
+        preview: address of the picture, relative to the card.
     """
     facts = summary(root)
     header = {
@@ -43,7 +46,7 @@ def dataset_card(root: Path, license_name: str, citation: str = CITATION) -> str
         "",
         f"# {facts['task']}: {facts['instruction']}",
         "",
-        f"![Preview]({PREVIEW})",
+        f"![Preview]({preview})",
         "",
         f"{episodes} episodes, {facts['frames']} frames at {facts['rate_hz']} Hz "
         f"({facts['duration_min']} minutes). {facts['success_at_last']} of them "

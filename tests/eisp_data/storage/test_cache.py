@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from storage_samples import random_episode, spec_of
 
-from eisp_data.storage.cache import episode_slices, fingerprint, load_arrays
+from eisp_data.errors import DataError
+from eisp_data.storage.cache import episode_slices, fingerprint, load_arrays, load_images
 from eisp_data.storage.lerobot import DatasetWriter
 
 ROWS = ("observation", "achieved_goal", "success", "sim_state")
@@ -75,6 +76,17 @@ def test_a_read_only_dataset_is_cached_elsewhere(make_dataset, tmp_path, monkeyp
     monkeypatch.setattr(os, "access", lambda p, m: str(root) not in str(p) and access(p, m))
     check(load_arrays(root), episodes)
     assert any((tmp_path / "home/eisp").iterdir())
+
+
+def test_images_have_the_rows_of_the_arrays(make_dataset):
+    root, episodes = make_dataset(cameras=True)
+    images, arrays = load_images(root, "top"), load_arrays(root)
+    assert isinstance(images, np.memmap) and len(images) == len(arrays.reward)
+    for rows, episode in zip(episode_slices(arrays), episodes, strict=True):
+        assert np.abs(images[rows].astype(int) - episode.images["top"]).mean() < 4
+    assert len(list((root / ".cache/eisp").iterdir())) == 2
+    with pytest.raises(DataError, match=r"no camera 'wrist'; there are top"):
+        load_images(root, "wrist")
 
 
 def _load(root, barrier, results):

@@ -100,7 +100,7 @@ def test_help_names_every_command(eisp_data):
         (["validate", "/nowhere"], "/nowhere: no such file or folder"),
         (["merge", "/nowhere", "--to", "/tmp/x"], "/nowhere: not a LeRobot dataset"),
         (["repair", "/nowhere"], "/nowhere: no such file or folder"),
-        (["info", "--jsn", "x"], "--jsn"),
+        (["info", "x", "--jsn"], "--jsn"),
         (["push", "/nowhere", "--repo-id", "a/b"], "/nowhere: neither a dataset"),
         (["pull", "a/b", "--to", "/tmp"], "/tmp: exists already"),
     ],

@@ -21,7 +21,7 @@ from eisp_data.storage.lerobot import DatasetWriter, read_episodes
 from eisp_data.storage.repair import repair
 from eisp_data.storage.validate import validate
 
-MUTATIONS = int(os.environ.get("EISP_MUTATIONS", "60"))
+MUTATIONS = int(os.environ.get("EISP_MUTATIONS", "40"))
 
 
 def failed(root):

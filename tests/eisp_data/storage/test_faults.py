@@ -25,7 +25,7 @@ from eisp_data.storage.lerobot import DatasetWriter, read_episodes
 from eisp_data.storage.repair import repair
 from eisp_data.storage.validate import validate
 
-KILLS = int(os.environ.get("EISP_KILLS", "8"))
+KILLS = int(os.environ.get("EISP_KILLS", "6"))
 BATCH = 3
 
 # Imports once and forks a writer for each line it reads, so that a kill costs no start-up.
