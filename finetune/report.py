@@ -343,7 +343,7 @@ def _failures(run: Run) -> str:
         names[-1] = f"≥{names[-1]}"
     chart = bar_chart(
         "Episodes",
-        "distance from the last subgoal to what was achieved, m (lower end of each range)",
+        "distance to the last subgoal, m (lower end of each range)",
         names,
         [("failed", distance["failures"], _RED), ("successful", distance["successes"], _BLUE)],
     )
