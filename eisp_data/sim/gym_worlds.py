@@ -52,8 +52,9 @@ class GymWorlds:
         self._envs = [_make(env_id) for _ in range(count)]
         dims, action_space = _check(self._envs[0], env_id)
         self.observation_dim, self.goal_dim, _ = dims
-        self._low, self._high = action_space.low, action_space.high
-        self.action_dim = len(self._low)
+        self._centre = (action_space.high + action_space.low) / 2
+        self._half = (action_space.high - action_space.low) / 2
+        self.action_dim = len(self._centre)
         assert self._envs[0].spec is not None
         self.episode_steps = int(self._envs[0].spec.max_episode_steps or 0)
         self.fps = int(self._envs[0].metadata.get("render_fps") or 25)
@@ -87,9 +88,8 @@ class GymWorlds:
             self._step(index, exact[index])
 
     def _step(self, index: int, action: np.ndarray) -> None:
-        share = (np.clip(action, -1.0, 1.0) + 1.0) / 2.0
-        scaled = (self._low + share * (self._high - self._low)).astype(self._low.dtype)
-        seen, _, done, _, info = self._envs[index].step(scaled)
+        scaled = self._centre + self._half * np.clip(action, -1.0, 1.0)
+        seen, _, done, _, info = self._envs[index].step(scaled.astype(self._centre.dtype))
         self._see(index, seen, info)
         self.done[index] = done
         self._actions[index, self.steps[index]] = action
