@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from eisp_data.cli.collect import episode_seeds
+from eisp_data.collect import explore
 from eisp_data.config import load_yaml
 from eisp_data.errors import ConfigError, DataError
 from eisp_data.sim.gym_worlds import AnyWorlds, GymWorlds
@@ -113,18 +115,16 @@ def _from_nothing(env_id: str, seed: int) -> tuple[Agent, Trajectories]:
     """Return a fresh agent for an environment, and episodes of random actions in it."""
     worlds = GymWorlds(env_id, 1)
     layout = Layout(worlds.observation_dim, worlds.goal_dim, worlds.action_dim)
-    data = Trajectories(layout, 10**9, None, purposeful=False)
-    rng = np.random.default_rng(seed)
-    rows = []
-    for episode in range(_FIRST_EPISODES):
-        worlds.reset([seed * _FIRST_EPISODES + episode])
-        for _ in range(worlds.episode_steps + 1):
-            action = rng.uniform(-1.0, 1.0, (1, layout.action_dim)).astype(np.float32)
-            rows.append((worlds.observation.copy(), worlds.achieved_goal.copy(), action))
-            worlds.step(action)
-    starts = np.arange(_FIRST_EPISODES + 1) * (worlds.episode_steps + 1)
-    observation, achieved, action = (np.concatenate(c) for c in zip(*rows, strict=True))
-    data.extend(observation, achieved, action, starts)
-    bank = achieved[rng.integers(len(achieved), size=BANK)]
     config = preset("cpu", env_id, Path(), Path()).agent
-    return Agent(config, layout, data.moments(), torch.from_numpy(bank)), data
+    episodes = list(explore(worlds, episode_seeds(seed, 0, _FIRST_EPISODES)))
+    worlds.close()
+    data = Trajectories(layout, 10**9, config.waypoints, purposeful=False)
+    data.extend(
+        np.concatenate([episode.observation for episode in episodes]),
+        np.concatenate([episode.achieved_goal for episode in episodes]),
+        np.concatenate([np.pad(episode.action, ((0, 1), (0, 0))) for episode in episodes]),
+        np.cumsum([0, *(len(episode) + 1 for episode in episodes)]),
+    )
+    drawn = np.random.default_rng(seed).integers(len(data), size=BANK)
+    bank = torch.from_numpy(data.achieved_goal[drawn])
+    return Agent(config, layout, data.moments(), bank), data

@@ -42,13 +42,15 @@ def moves(achieved_goal: np.ndarray) -> list[Move]:
     """Cut a trajectory into moves.
 
     Args:
-        achieved_goal: (T + 1, G), three coordinates an object in metres.
+        achieved_goal: (T + 1, G), three coordinates an object in metres; where G is no multiple
+            of three, all of it counts as one object.
 
     Returns:
         The moves in time, but for one that the end of the trajectory cuts off; consecutive moves
         of the same objects count as one, because a push that is re-aimed is still one push.
     """
-    places = achieved_goal.reshape(len(achieved_goal), -1, 3)
+    count, goal_dim = achieved_goal.shape
+    places = achieved_goal.reshape(count, -1, goal_dim if goal_dim % 3 else 3)
     steps = np.linalg.norm(np.diff(places, axis=0), axis=-1).max(axis=1) > _MOVING_M
     found: list[Move] = []
     for start, end in _runs(steps):

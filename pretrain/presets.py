@@ -30,6 +30,10 @@ def preset(name: PresetName, task: str, root: Path, output_dir: Path) -> Pretrai
     return _PRESETS[name](task, root, output_dir)
 
 
+_FOREIGN_WAYPOINTS = 4
+"""The paper's n of Stack and Push4 (Table I)."""
+
+
 def _cpu(task: str, root: Path, output_dir: Path) -> PretrainConfig:
     objects = len(TASKS[task].objects) if task in TASKS else 1
     known = task in TASKS
@@ -40,6 +44,8 @@ def _cpu(task: str, root: Path, output_dir: Path) -> PretrainConfig:
             task=task,
             features="objects" if known else "plain",
             generator="movers" if known else "hybrid",
+            # In an environment of which nothing is known, nothing may ever come to rest.
+            waypoints=None if known else _FOREIGN_WAYPOINTS,
             sac=SacConfig(lr=1e-3, gamma=0.98),
             # Each of n objects may be off by a share of the task's tolerance.
             mix=GoalMix(tolerance_m=SUCCESS_DISTANCE_M / objects**0.5),

@@ -111,8 +111,10 @@ def validate(agent: Agent, held_out: Trajectories, device: str) -> dict[str, Ten
     _, info = agent.proposer.loss(observation, goal, subgoal)
     proposed = agent.proposer.propose(observation, goal, 1)[0][:, 0]
     hits = (proposed - subgoal).norm(dim=-1) <= _NEAR_M
-    part = proposed[:256].view(-1, 1, proposed.shape[1] // 3, 3)
-    known = agent.bank.view(1, len(agent.bank), -1, 3)
+    goal_dim = agent.layout.goal_dim
+    each = 3 if agent.layout.objects else goal_dim
+    part = proposed[:256].view(-1, 1, goal_dim // each, each)
+    known = agent.bank.view(1, len(agent.bank), -1, each)
     apart = (part - known).norm(dim=-1).amax(-1).amin(-1)
     near = apart <= _NEAR_M
     return info | {"hits": hits.float().mean(), "near_data": near.float().mean()}
