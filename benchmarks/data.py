@@ -26,6 +26,7 @@ from eisp_data.episode import Episode
 from eisp_data.storage.cache import DatasetArrays, load_arrays
 from eisp_data.storage.lerobot import DatasetSpec, DatasetWriter
 from eisp_data.storage.schema import SIDECAR_COLUMN, features
+from eisp_data.storage.video import feature_info
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,8 +107,14 @@ def write_ours(folder: Path, spec: DatasetSpec, episodes: list[Episode]) -> floa
     return rate
 
 
-def write_peer(folder: Path, spec: DatasetSpec, episodes: list[Episode]) -> float:
-    """Return frames/s of ``add_frame`` and ``save_episode``, streaming its video."""
+def write_peer(
+    folder: Path, spec: DatasetSpec, episodes: list[Episode], our_codec: bool = False
+) -> float:
+    """Return frames/s of ``add_frame`` and ``save_episode``, streaming its video.
+
+    Its codec is AV1 unless ``our_codec`` gives it the H.264 settings of ours.
+    """
+    from lerobot.configs import RGBEncoderConfig
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     table = features(spec, {})
@@ -123,6 +130,7 @@ def write_peer(folder: Path, spec: DatasetSpec, episodes: list[Episode]) -> floa
         root=folder / "peer",
         use_videos=bool(spec.cameras),
         streaming_encoding=bool(spec.cameras),
+        rgb_encoder=RGBEncoderConfig.from_video_info(feature_info(spec.fps)) if our_codec else None,
         # Its queue drops frames when full; one as long as the episode makes it keep them all.
         encoder_queue_maxsize=len(episodes[0]) + 1,
     )
@@ -185,9 +193,7 @@ def sample_ours(arrays: DatasetArrays, batch: int, seconds: float = 1.0) -> floa
     rng = np.random.default_rng(0)
     starts, counts = arrays.episode_start, np.diff(arrays.episode_start) - 1
     # Every row that has an action, and the last row of its episode.
-    rows = np.concatenate(
-        [np.arange(s, s + n) for s, n in zip(starts[:-1], counts, strict=True)]
-    )
+    rows = np.concatenate([np.arange(s, s + n) for s, n in zip(starts[:-1], counts, strict=True)])
     last = np.repeat(starts[1:] - 1, counts)
     drawn, begin = 0, time.perf_counter()
     while time.perf_counter() - begin < seconds:
@@ -234,9 +240,12 @@ def main(options: Options) -> None:
         spec = spec_of(cameras)
         episodes = [episode(spec, options.steps, seed) for seed in range(count)]
         peers = episodes[: options.peer_episodes]
-        theirs = best(lambda f, s=spec, e=peers: write_peer(f, s, e), options.repeats)
         ours = best(lambda f, s=spec, e=episodes: write_ours(f, s, e), options.repeats)
-        rows.append((f"{name}, frames/s", theirs, ours))
+        for codec, same in (("", False), (", same codec", True))[: 2 if cameras else 1]:
+            theirs = best(
+                lambda f, s=spec, e=peers, c=same: write_peer(f, s, e, c), options.repeats
+            )
+            rows.append((f"{name}{codec}, frames/s", theirs, ours))
     spec = spec_of({})
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "ours"
