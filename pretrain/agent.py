@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import torch
 from safetensors.torch import load_file, save_file
@@ -12,6 +11,7 @@ from torch import Tensor, nn
 
 from eisp_data.config import from_plain, to_plain
 from eisp_data.errors import ConfigError, DataError
+from eisp_data.storage.files import one_line, replace_atomically, write_json
 from pretrain.config import AgentConfig
 from pretrain.features import ObjectFeatures, PlainFeatures
 from pretrain.layout import Layout
@@ -60,34 +60,28 @@ class Agent(nn.Module):
         self.register_buffer("bank", bank)
 
     def save(self, folder: Path) -> None:
-        """Write ``config.json`` and ``model.safetensors``."""
-        folder.mkdir(parents=True, exist_ok=True)
+        """Write ``config.json`` and ``model.safetensors``, each whole or not at all."""
         # Modules share the feature buffers; a file must not.
         tensors = {name: value.clone().contiguous() for name, value in self.state_dict().items()}
-        save_file(tensors, folder / "model.safetensors")
+        replace_atomically(folder / "model.safetensors", lambda path: save_file(tensors, path))
         plain = {"agent": to_plain(self.config), "layout": to_plain(self.layout)}
-        (folder / "config.json").write_text(json.dumps(plain, indent=2))
+        write_json(folder / "config.json", plain)
 
     @classmethod
     def load(cls, folder: Path, device: str = "cpu") -> Agent:
         """Read what ``save`` wrote; DataError if it cannot be read."""
+        for name in ("config.json", "model.safetensors"):
+            if not (folder / name).is_file():
+                raise DataError(f"{folder} holds no policy: {name} is missing")
         try:
-            plain: dict[str, Any] = json.loads((folder / "config.json").read_text())
+            plain = json.loads((folder / "config.json").read_text())
             tensors = load_file(folder / "model.safetensors")
-        except FileNotFoundError as error:
-            raise DataError(
-                f"{folder} holds no policy: {Path(error.filename or '').name} is missing"
-            ) from None
-        except Exception as error:  # safetensors and json each have errors of their own
-            raise DataError(f"{folder} holds no readable policy: {error}") from None
-        layout = from_plain(Layout, plain["layout"])
-        agent = cls(
-            from_plain(AgentConfig, plain["agent"]),
-            layout,
-            empty_moments(layout),
-            torch.zeros_like(tensors["bank"]),
-        )
-        agent.load_state_dict(tensors)
+            layout = from_plain(Layout, plain["layout"])
+            config = from_plain(AgentConfig, plain["agent"])
+            agent = cls(config, layout, empty_moments(layout), torch.zeros_like(tensors["bank"]))
+            agent.load_state_dict(tensors)
+        except Exception as error:  # json, safetensors and torch each have errors of their own
+            raise DataError(f"{folder} holds no readable policy: {one_line(error)}") from None
         return agent.to(device)
 
 

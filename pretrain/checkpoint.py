@@ -8,7 +8,6 @@ Nothing is pickled.
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,6 +20,7 @@ from safetensors.numpy import save_file as save_arrays
 from torch import Tensor
 
 from eisp_data.errors import DataError
+from eisp_data.storage.files import one_line, sync
 from pretrain.agent import Agent
 from pretrain.saved import POLICY
 
@@ -64,16 +64,17 @@ def save(
     (state / "state.json").write_text(
         json.dumps({"step": step, "rng": rng.bit_generator.state, "numbers": dict(numbers)})
     )
-    for path in (*state.iterdir(), *(draft / POLICY).iterdir()):
-        with path.open("rb") as file:
-            os.fsync(file.fileno())
+    for path in (*state.iterdir(), state, draft / POLICY, draft):
+        sync(path)
     shutil.rmtree(folder, ignore_errors=True)
     draft.rename(folder)
     link = folder.with_name(".last")
     link.unlink(missing_ok=True)
     link.symlink_to(folder.name)
     link.rename(folder.with_name("last"))
-    for old in sorted(p for p in folder.parent.iterdir() if p.name.isdigit())[:-_KEPT]:
+    sync(folder.parent)
+    steps = [path for path in folder.parent.iterdir() if path.name.isdigit()]
+    for old in sorted(steps, key=lambda path: int(path.name))[:-_KEPT]:
         shutil.rmtree(old)
 
 
@@ -87,19 +88,24 @@ def restore(
 
     Returns:
         Its step, its numbers and its arrays.
+
+    Raises:
+        DataError: it is damaged, or of an agent made with other settings.
     """
     folder = run / "checkpoints" / "last"
-    agent.load_state_dict(Agent.load(folder / POLICY).state_dict())
+    saved = Agent.load(folder / POLICY).state_dict()
     try:
+        agent.load_state_dict(saved)
         plain = json.loads((folder / _STATE / "state.json").read_text())
         tensors = load_arrays(folder / _STATE / "state.safetensors")
-    except Exception as error:  # each format has errors of its own
-        raise DataError(f"{folder} cannot be resumed from: {error}") from None
-    _unflatten(optimizers, tensors)
-    torch.set_rng_state(torch.from_numpy(tensors["torch_rng"]))
-    rng.bit_generator.state = plain["rng"]
+        _unflatten(optimizers, tensors)
+        torch.set_rng_state(torch.from_numpy(tensors["torch_rng"]))
+        rng.bit_generator.state = plain["rng"]
+        step, numbers = plain["step"], plain["numbers"]
+    except Exception as error:  # torch and each format have errors of their own
+        raise DataError(f"{folder} cannot be resumed from: {one_line(error)}") from None
     arrays = {k.removeprefix("array/"): v for k, v in tensors.items() if k.startswith("array/")}
-    return plain["step"], plain["numbers"], arrays
+    return step, numbers, arrays
 
 
 def exists(run: Path) -> bool:

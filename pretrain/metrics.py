@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from eisp_data.storage.files import replace_atomically
+
 
 class MetricsLog:
     """Appends to ``metrics.jsonl`` and to TensorBoard's event files beside it.
@@ -23,7 +25,8 @@ class MetricsLog:
         self._stage = stage
         path = run / "metrics.jsonl"
         lines = path.read_text().splitlines() if path.exists() else []
-        path.write_text("".join(f"{line}\n" for line in lines if self._keeps(line, done)))
+        kept = "".join(f"{line}\n" for line in lines if self._keeps(line, done))
+        replace_atomically(path, lambda draft: draft.write_text(kept))
         self._file = path.open("a")
         self._board = SummaryWriter(str(run), purge_step=done or None)
 

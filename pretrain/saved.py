@@ -31,5 +31,5 @@ def saved_subgoals(path: Path) -> SubgoalConfig:
     try:
         plain = json.loads((find_policy(path) / "config.json").read_text())
         return from_plain(SubgoalConfig, plain["agent"]["subgoals"])
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path} holds no readable policy: {error}") from None
