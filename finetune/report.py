@@ -17,6 +17,7 @@ from typing import Any
 from eisp_data.errors import ConfigError, DataError
 from finetune import page
 from finetune.charts import Level, Region, Series, bar_chart, line_chart
+from finetune.results import HEAD, percent, result_rows, signed
 from finetune.video import middle_frame
 
 REPORT = "report.html"
@@ -142,61 +143,35 @@ def _cards(run: Run) -> list[tuple[str, str]]:
     for evaluation, when in ((run.after, "after"), (run.before, "before")):
         if evaluation:
             entries.append(
-                (_percent(evaluation["success_last"]["mean"]), f"successful {when} fine-tuning")
+                (percent(evaluation["success_last"]["mean"]), f"successful {when} fine-tuning")
             )
     evaluation = run.after or run.before
     if evaluation and evaluation.get("return"):
         paper = evaluation.get("paper_return")
-        beside = f"; the paper reports {_signed(paper)}" if paper is not None else ""
-        entries.append((_signed(evaluation["return"]["mean"]), f"return{beside}"))
+        beside = f"; the paper reports {signed(paper)}" if paper is not None else ""
+        entries.append((signed(evaluation["return"]["mean"]), f"return{beside}"))
     if evaluation and evaluation.get("relative_return"):
-        relative = _percent(evaluation["relative_return"]["mean"])
+        relative = percent(evaluation["relative_return"]["mean"])
         entries.append((relative, "of the oracle's return, counted from failure"))
     return entries
 
 
 def _results(run: Run) -> str:
-    rows = [
-        [name, *(_estimate(evaluation.get(k), form) for k, form in _COLUMNS)]
-        for name, evaluation in (
-            ("Before fine-tuning", run.before),
-            ("After fine-tuning", run.after),
-        )
-        if evaluation
-    ]
     known = run.after or run.before
     if known is None:
         return page.section("Results", "There is no evaluation in this run.")
-    strong = len(rows) - 1 if run.after else None
-    paper, oracle = known.get("paper_return"), known.get("oracle_return")
-    if paper is not None:
-        relative = _relative(paper, oracle, run.task)
-        rows.append(["The paper (EISP, Table II)", "–", "–", _signed(paper), relative])
-    if oracle is not None:
-        rows.append(["Oracle (noise-free script)", "–", "–", _signed(oracle), "100%"])
     text = (
         f"Over {known['episodes']} fresh episodes, seeds {known['seed']} and up, none of them "
         "learned from. Success is the paper's Eq. (1): the whole goal error is at most 5 cm. "
         "The return is minus the number of steps at which it is not. Brackets: the 95% interval. "
         "Relative to the oracle, 0% is never successful and 100% is as quick as the script."
     )
-    head = [
-        "",
-        "success at the last step",
-        "success at any step",
-        "return",
-        "relative to the oracle",
+    rows = [
+        [page.escape(name), *(f"{f.value} <small>{f.interval}</small>" for f in figures)]
+        for name, figures in result_rows(run.before, run.after)
     ]
-    return page.section("Results", text, page.table(head, rows, strong))
-
-
-def _relative(value: float, oracle: float | None, task: str) -> str:
-    from eisp_data.tasks.registry import TASKS
-
-    if oracle is None or task not in TASKS:
-        return "–"
-    length = TASKS[task].paper.episode_steps
-    return _percent((value + length) / (oracle + length))
+    strong = int(bool(run.before)) if run.after else None
+    return page.section("Results", text, page.table(HEAD, rows, strong))
 
 
 def _video(run: Run) -> str:
@@ -290,7 +265,7 @@ def _dip_in_words(online: Sequence[dict[str, Any]]) -> str:
 
     curve = [{"env_steps": m["env_steps"], "success_last": m["eval/success_last"]} for m in online]
     facts = summarise(curve)
-    first = _percent(facts["offline_success"])
+    first = percent(facts["offline_success"])
     if facts["dip"] <= 0.0:
         return f"Going online did not set the policy back: it started at {first} and stayed above."
     dip = f"Going online first cost {100 * facts['dip']:.0f} points of the {first} at the start; "
@@ -363,26 +338,3 @@ def _configuration(run: Run) -> str:
     return page.section(
         "Configuration", text, *(page.details(n, t) for n, t in run.configs.items())
     )
-
-
-def _estimate(estimate: dict[str, float] | None, form: Any) -> str:
-    if not estimate:
-        return "–"
-    low, high = form(estimate["low"]), form(estimate["high"])
-    return f"{form(estimate['mean'])} <small>[{low}, {high}]</small>"
-
-
-def _percent(value: float) -> str:
-    return f"{100 * value:.0f}%".replace("-", "−")
-
-
-def _signed(value: float) -> str:
-    return f"{value:.1f}".replace("-", "−")
-
-
-_COLUMNS = (
-    ("success_last", _percent),
-    ("success_any", _percent),
-    ("return", _signed),
-    ("relative_return", _percent),
-)

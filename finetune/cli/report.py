@@ -25,9 +25,14 @@ def main() -> None:
 
 def report(config: ReportConfig) -> None:
     """Make one page of a run, with results, learning curves and a film; print where it is."""
-    from finetune.report import write_report
+    from finetune.report import read_run, write_report
+    from finetune.results import results_text
 
-    print(write_report(config.run_dir, config.output))
+    path = write_report(config.run_dir, config.output)
+    found = read_run(config.run_dir)
+    if found.before or found.after:
+        print(results_text(found.before, found.after))
+    print(f"report: {path}")
 
 
 if __name__ == "__main__":
