@@ -8,6 +8,7 @@ from finetune.config import EvaluateConfig
 from finetune.evaluate import Evaluation, evaluate, oracle_return
 from finetune.run import load_for_rollouts, make_worlds
 from finetune.video import Film
+from pretrain.checks import at_least, check_subgoals
 from pretrain.device import set_up
 
 _ORACLE_EPISODES = 100
@@ -16,8 +17,9 @@ _BATCH = 100
 
 def assess(config: EvaluateConfig) -> Evaluation:
     """Evaluate a policy, and film its first episode if asked to."""
-    if config.episodes < 1:
-        raise ConfigError(f"--episodes {config.episodes}: at least one is needed")
+    at_least(1, {"--episodes": config.episodes, "--threads": config.threads})
+    at_least(0, {"--seed": config.seed})
+    check_subgoals(config.subgoals, "--subgoals")
     device = set_up(config.device, config.threads)
     agent = load_for_rollouts(config.policy.path, config.subgoals, device)
     name = agent.config.task

@@ -21,13 +21,14 @@ from eisp_data.tasks.registry import TASKS
 from finetune.config import FinetuneConfig
 from finetune.train import Finetuner
 from pretrain.agent import BANK, Agent
+from pretrain.checks import at_least, check_subgoals
 from pretrain.config import PretrainConfig, SubgoalConfig
 from pretrain.device import describe, set_up
 from pretrain.layout import Layout
 from pretrain.presets import preset
 from pretrain.replay import Trajectories
 from pretrain.saved import find_policy
-from pretrain.train import gather, prepare_run
+from pretrain.train import begin_run, gather, has_progress
 
 _FIRST_EPISODES = 100
 """Episodes of random actions before learning from nothing."""
@@ -36,7 +37,8 @@ _FIRST_EPISODES = 100
 def finetune(config: FinetuneConfig) -> dict[str, float]:
     """Fine-tune an agent; return the summary that is also in ``summary.json`` of the run."""
     run = config.output_dir
-    prepare_run(run, config, config.resume, "finetune.yaml")
+    _check(config)
+    resumed = has_progress(run, config.resume, "finetune.yaml")
     device = set_up(config.device, config.threads)
     print(describe(device), flush=True)
     torch.manual_seed(config.seed)
@@ -47,7 +49,6 @@ def finetune(config: FinetuneConfig) -> dict[str, float]:
     else:
         agent = Agent.load(find_policy(config.policy.path))
         data = _dataset(config, agent)
-        _keep_history(config.policy.path, run)
     name = config.env.id or agent.config.task
     if name != agent.config.task:
         raise ConfigError(
@@ -63,9 +64,35 @@ def finetune(config: FinetuneConfig) -> dict[str, float]:
         config.seed,
         device,
     )
-    summary = finetuner(config.resume)
+    begin_run(run, config, "finetune.yaml")
+    if config.policy.path and not resumed:
+        _keep_history(config.policy.path, run)
+    summary = finetuner(resumed)
     (run / "summary.json").write_text(json.dumps(summary, indent=2))
     return summary
+
+
+def _check(config: FinetuneConfig) -> None:
+    online = config.online
+    at_least(0, {"--seed": config.seed, "--online.generator-every": online.generator_every})
+    at_least(
+        1,
+        {
+            "--online.rounds": online.rounds,
+            "--online.worlds": online.worlds,
+            "--online.round-steps": online.round_steps,
+            "--online.updates": online.updates,
+            "--online.batch-size": online.batch_size,
+            "--online.generator-batch-size": online.generator_batch_size,
+            "--online.evaluate-every": online.evaluate_every,
+            "--online.evaluation-episodes": online.evaluation_episodes,
+            "--threads": config.threads,
+        },
+    )
+    at_least(online.round_steps + 1, {"--online.replay-size": online.replay_size})
+    if not 0 <= online.offline_share <= 1:
+        raise ConfigError(f"--online.offline-share must be 0 to 1; got {online.offline_share}")
+    check_subgoals(config.subgoals, "--subgoals")
 
 
 def make_worlds(name: str, count: int) -> AnyWorlds:
@@ -83,7 +110,7 @@ def load_for_rollouts(path: Path | None, subgoals: SubgoalConfig, device: str) -
 
 
 def _dataset(config: FinetuneConfig, agent: Agent) -> Trajectories:
-    """Return the training episodes of the dataset that the agent was pretrained on."""
+    """Return all episodes of the dataset that the agent was pretrained on."""
     root = config.dataset.root or _pretraining_dataset(config.policy.path)
     arrays = load_arrays(root)
     if arrays.spec.task != agent.config.task:
@@ -106,7 +133,7 @@ def _keep_history(policy: Path, run: Path) -> None:
     """Start the run's metrics with those of the pretraining, so that one curve shows both."""
     for folder in (policy, *policy.resolve().parents):
         history = folder / "metrics.jsonl"
-        if history.exists() and not (run / "metrics.jsonl").exists():
+        if history.exists():
             shutil.copy(history, run / "metrics.jsonl")
             return
 

@@ -145,7 +145,8 @@ class Finetuner:
         """Train, or go on training, to the last round; return the summary of the run."""
         if resume:
             self._restore()
-        log = MetricsLog(self.run, "finetune", self._round * self.config.updates)
+        done = self._round * self.config.updates if resume else -1
+        log = MetricsLog(self.run, "finetune", done)
         start = time.monotonic() - self._spent
         if not resume:
             self._rollouts.start(np.arange(self.config.worlds))

@@ -16,7 +16,8 @@ class MetricsLog:
     Args:
         run: the run's folder.
         stage: ``pretrain`` or ``finetune``; other stages' lines in the file stay as they are.
-        done: drop what this stage has logged after this many updates: a resumed run does it again.
+        done: drop what this stage has logged after this many updates: a resumed run does it again;
+            -1 drops all.
     """
 
     def __init__(self, run: Path, stage: str, done: int) -> None:
@@ -28,7 +29,7 @@ class MetricsLog:
         kept = "".join(f"{line}\n" for line in lines if self._keeps(line, done))
         replace_atomically(path, lambda draft: draft.write_text(kept))
         self._file = path.open("a")
-        self._board = SummaryWriter(str(run), purge_step=done or None)
+        self._board = SummaryWriter(str(run), purge_step=done + 1)
 
     def _keeps(self, line: str, done: int) -> bool:
         try:

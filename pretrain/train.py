@@ -16,6 +16,7 @@ from eisp_data.storage.cache import DatasetArrays, load_arrays
 from eisp_data.tasks.registry import TASKS
 from pretrain import checkpoint
 from pretrain.agent import BANK, Agent
+from pretrain.checks import check_pretrain
 from pretrain.config import PretrainConfig
 from pretrain.device import describe, set_up
 from pretrain.layout import Layout
@@ -30,7 +31,8 @@ _NEAR_M = 0.05
 def pretrain(config: PretrainConfig) -> Path:
     """Pretrain an agent; return the folder of the run."""
     run = config.output_dir
-    resumed = prepare_run(run, config, config.resume, "pretrain.yaml")
+    check_pretrain(config)
+    resumed = has_progress(run, config.resume, "pretrain.yaml")
     device = set_up(config.device, config.threads)
     print(describe(device), flush=True)
     train, held_out, layout = load_trajectories(config)
@@ -38,6 +40,7 @@ def pretrain(config: PretrainConfig) -> Path:
     rng = np.random.default_rng(config.seed)
     bank = train.achieved_goal[rng.integers(len(train), size=BANK)]
     agent = Agent(config.agent, layout, train.moments(), torch.from_numpy(bank)).to(device)
+    begin_run(run, config, "pretrain.yaml")
     sac = SacOptimizer(agent.sac, config.agent.sac.lr)
     generator = torch.optim.Adam(agent.proposer.parameters(), lr=config.generator_lr, fused=True)
     optimizers = {"actor": sac.actor, "critic": sac.critic, "generator": generator}
@@ -166,15 +169,23 @@ def gather(
     return data
 
 
-def prepare_run(run: Path, config: object, resume: bool, name: str) -> bool:
-    """Make the folder of a run and write its configuration; return whether to resume it."""
-    if resume and not checkpoint.exists(run):
-        raise ConfigError(f"--resume: {run} holds no checkpoint")
+def has_progress(run: Path, resume: bool, name: str) -> bool:
+    """Return whether the run has a checkpoint to go on from; a resumed one may have none yet.
+
+    Raises:
+        ConfigError: there is no such run to resume, or something is in the way of a new one.
+    """
+    if resume and not (run / name).exists():
+        raise ConfigError(f"--resume: {run} holds no run, {name} is missing")
     if not resume and run.exists() and any(run.iterdir()):
         raise ConfigError(f"{run} is not empty; add --resume or choose another --output-dir")
+    return resume and checkpoint.exists(run)
+
+
+def begin_run(run: Path, config: object, name: str) -> None:
+    """Make the folder of a run and write its configuration, once all input has proved usable."""
     try:
         run.mkdir(parents=True, exist_ok=True)
         save_yaml(config, run / name)
     except OSError as error:
         raise ConfigError(f"cannot write to {run}: {error.strerror}") from None
-    return resume

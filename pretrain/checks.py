@@ -1,0 +1,62 @@
+"""Settings that cannot be used, told in one line before anything is read or written."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from eisp_data.errors import ConfigError
+from pretrain.config import GoalMix, PretrainConfig, SubgoalConfig
+
+_ROUNDING = 1e-6
+
+
+def at_least(least: int, options: Mapping[str, int | None]) -> None:
+    """Raise ConfigError, naming the option, unless each that is given is at least this."""
+    for flag, value in options.items():
+        if value is not None and value < least:
+            raise ConfigError(f"{flag} must be at least {least}; got {value}")
+
+
+def check_pretrain(config: PretrainConfig) -> None:
+    """Raise ConfigError unless the settings can be used."""
+    at_least(0, {"--seed": config.seed})
+    at_least(
+        1,
+        {
+            "--updates": config.updates,
+            "--batch-size": config.batch_size,
+            "--generator-every": config.generator_every,
+            "--generator-batch-size": config.generator_batch_size,
+            "--validate-every": config.validate_every,
+            "--threads": config.threads,
+            "--agent.waypoints": config.agent.waypoints,
+            "--agent.mix.horizon": config.agent.mix.horizon,
+        },
+    )
+    if not 0 < config.validation_share < 1:
+        raise ConfigError(
+            f"--validation-share must be between 0 and 1; got {config.validation_share}"
+        )
+    if not 0 <= config.agent.sac.gamma < 1:
+        raise ConfigError(
+            f"--agent.sac.gamma must be at least 0 and below 1; got {config.agent.sac.gamma}"
+        )
+    _check_mix(config.agent.mix)
+    check_subgoals(config.agent.subgoals, "--agent.subgoals")
+
+
+def check_subgoals(config: SubgoalConfig, flag: str) -> None:
+    """Raise ConfigError unless subgoals can be chosen so; the options are under ``flag``."""
+    at_least(
+        1, {f"{flag}.candidates": config.candidates, f"{flag}.every-steps": config.every_steps}
+    )
+
+
+def _check_mix(mix: GoalMix) -> None:
+    shares = mix.waypoint, mix.future, mix.displaced
+    if min(shares) < 0 or abs(sum(shares) - 1) > _ROUNDING:
+        said = ", ".join(map(str, shares))
+        raise ConfigError(
+            "--agent.mix: the shares of waypoint, future and displaced goals must add up to 1; "
+            f"got {said}"
+        )
