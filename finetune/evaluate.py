@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from eisp_data.policies.registry import SCRIPTS
 from eisp_data.policies.script import Noise, ScriptedPolicy
@@ -94,8 +95,11 @@ def evaluate(
         watch: called with worlds and policy after every step of the first batch.
     """
     parts = []
-    for first in range(0, episodes, worlds.count):
-        parts.append(_batch(agent, worlds, seed + first, device, watch if first == 0 else None))
+    # The same seeds give the same figures, and a run that is evaluated keeps its own randomness.
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        for first in range(0, episodes, worlds.count):
+            parts.append(_batch(agent, worlds, seed + first, device, watch if first == 0 else None))
     last, settled, some, returns, distance = (
         np.concatenate(column)[:episodes] for column in zip(*parts, strict=True)
     )

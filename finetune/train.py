@@ -183,12 +183,9 @@ class Finetuner:
 
     def _evaluate(self, log: MetricsLog, info: dict[str, Tensor], start: float) -> Evaluation:
         count = self.config.evaluation_episodes
-        # Evaluating must not disturb the run's own random numbers: curves stay comparable.
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(0)
-            result = evaluate(
-                self.agent, self._evaluation_worlds, count, _SELECTION_SEED, device=self._device
-            )
+        result = evaluate(
+            self.agent, self._evaluation_worlds, count, _SELECTION_SEED, device=self._device
+        )
         env_steps = self._round * self.config.worlds * self.config.round_steps
         point = {
             "success_last": result.success_last.mean,
