@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from pathlib import Path
 
@@ -29,9 +30,11 @@ def _command(config: FinetuneConfig) -> None:
     from finetune.run import finetune
 
     summary = finetune(config)
+    steps = summary["recovery_steps"]
+    recovery = f"recovered after {steps:.0f} steps" if math.isfinite(steps) else "not recovered"
     print(
         f"success before {summary['offline_success']:.2f}, best {summary['best_success']:.2f}; "
-        f"deepest dip {summary['dip']:.2f}, recovered after {summary['recovery_steps']:.0f} steps"
+        f"deepest dip {summary['dip']:.2f}, {recovery}"
     )
     print(f"policy: {config.output_dir / 'best'}")
 
