@@ -133,7 +133,8 @@ class PretrainConfig:
     generator_every: int = 4
     """Updates of SAC for one of the generator."""
     generator_batch_size: int = 256
-    generator_lr: float = 1e-3
+    generator_lr: float = 2e-3
+    """Of the generator at the start; it falls linearly to a hundredth."""
     validation_share: float = 0.1
     """Share of the episodes that are held out."""
     validate_every: int = 1_000

@@ -118,10 +118,14 @@ class Waypoints:
 
         Args:
             rows: (B,) rows that have a waypoint after them.
-            rng: draws the final goals, uniformly among the waypoints that are no detour.
+            rng: draws the final goals: half of them the furthest waypoint that is no detour, for
+                far goals are what subgoals are for, and the others uniformly among all that are
+                none.
         """
         first = self.following[rows]
-        last = first + rng.integers(0, self.beyond[first] - first)
+        furthest = self.beyond[first] - 1
+        any_of_them = rng.integers(first, furthest + 1)
+        last = np.where(rng.random(len(rows)) < 0.5, furthest, any_of_them)
         return self.row[first], self.row[last]
 
     def joined(self, later: Waypoints) -> Waypoints:

@@ -49,10 +49,12 @@ class Movers(SubgoalProposer):
             self.register_buffer(name, first[:, None] + torch.arange(3), persistent=False)
         token = 20 + layout.kinds
         width = config.width
-        self.pairs = mlp(layout.robot_dim + 2 * token + 1, (width,), width)
-        self.context = mlp(layout.robot_dim + token + 2 * width, (width,), width)
-        self.weight = nn.Linear(width, 1)
-        self.moves = mlp(2 * width, (width,), 7)
+        pair = layout.robot_dim + 2 * token + _RELATION_DIM + 1
+        # Two bodies: densities of places are worth many nats, the choice of an object less than
+        # one, and would be drowned out in a shared one.
+        self.choice = mlp(pair, (width,), width)
+        self.weight = mlp(layout.robot_dim + token + 2 * width, (width,), 1)
+        self.moves = mlp(pair, (width, width), 7)
         self.decoder = mlp(layout.observation_dim + layout.goal_dim, (width,) * 2, layout.goal_dim)
         self.register_buffer("_same", torch.eye(count))
 
@@ -70,13 +72,13 @@ class Movers(SubgoalProposer):
         other = tokens[:, None].expand(-1, count, -1, -1)
         same = self._same.expand(batch, -1, -1)[..., None]
         around = robot[:, None, None].expand(-1, count, count, -1)
-        pair = torch.relu(self.pairs(torch.cat([around, mover, other, same], -1)))
-        pooled = torch.cat([pair.mean(2), pair.amax(2)], -1)
+        relation = _relations(tokens[..., :3], tokens[..., 6:9])
+        pairs = torch.cat([around, mover, other, relation, same], -1)
+        choice = torch.relu(self.choice(pairs))
+        pooled = torch.cat([choice.mean(2), choice.amax(2)], -1)
         context = torch.cat([robot[:, None].expand(-1, count, -1), tokens, pooled], -1)
-        context = torch.relu(self.context(context))
         logits = self.weight(context).squeeze(-1)
-        joined = torch.cat([pair, context[:, :, None].expand(-1, -1, count, -1)], -1)
-        gate, shift, spread = self.moves(joined).split([1, 3, 3], -1)
+        gate, shift, spread = self.moves(pairs).split([1, 3, 3], -1)
         way = other[..., 6:9]
         mean = torch.sigmoid(gate) * way + shift
         scale = nn.functional.softplus(spread).clamp(max=_MOST_SCALE) + _LEAST_SCALE
@@ -113,9 +115,11 @@ class Movers(SubgoalProposer):
     def loss(self, observation: Tensor, goal: Tensor, subgoal: Tensor) -> tuple[Tensor, Info]:
         """Return beta L_HS + reconstruction + divergence, weighted as configured."""
         log_weight, mean, scale = self.components(observation, goal)
-        target = self._relative(observation, subgoal)[:, None]
-        each = laplace.log_prob(target.flatten(2), mean.flatten(2), scale.flatten(2))
-        likelihood = (log_weight + each).logsumexp(1)
+        target = self._relative(observation, subgoal)
+        each = laplace.log_prob(target.flatten(1)[:, None], mean.flatten(2), scale.flatten(2))
+        # Which component it was is known in hindsight: that of the object that went furthest.
+        mover = target.norm(dim=-1).argmax(1, keepdim=True)
+        likelihood = (log_weight + each).gather(1, mover).squeeze(1)
         sampled = laplace.sample(mean, scale)
         places = self._place(observation)[:, None] * _SCALE + sampled
         state = observation[:, None].expand(-1, places.shape[1], -1)
@@ -138,3 +142,25 @@ class Movers(SubgoalProposer):
             "reconstruction_error": reconstruction.detach().mean(),
             "divergence": divergence.detach().mean(),
         }
+
+
+_RELATION_DIM = 12
+_NEAR = 0.3
+"""Decimetres within which one thing is on the place of another: less than the edge of a block."""
+
+
+def _relations(place: Tensor, way: Tensor) -> Tensor:
+    """Return (B, n, n, 12): object j, and its goal, seen from object i and from its goal.
+
+    What has to move first is a matter of these: who lies on whose goal, whose goal is below whose.
+    Three differences, and for each how near the two are in all.
+
+    Args:
+        place: (B, n, 3) decimetres.
+        way: (B, n, 3) from there to the goals.
+    """
+    goal = place + way
+    pairs = ((place, place), (goal, place), (goal, goal))
+    apart = torch.stack([theirs[:, None] - mine[:, :, None] for mine, theirs in pairs], -2)
+    near = torch.exp(-(apart / _NEAR).square().sum(-1))
+    return torch.cat([apart.flatten(-2), near], -1)
