@@ -179,6 +179,8 @@ def stage(
         name: np.concatenate([own[name] for own in batch.columns]) for name in batch.columns[0]
     }
     columns["index"] = np.arange(first_row, first_row + batch.num_frames)
+    # ``pages.py`` relies on this order when a footer is lost.
+    columns = {name: columns[name] for name in column_widths(spec)}
     write_rows(data, columns, batch.sidecars, [len(episode) for episode in batch.episodes])
     staged.append((data, Path(DATA_PATH.format(chunk_index=chunk, file_index=file))))
     rows: list[dict[str, object]] = []

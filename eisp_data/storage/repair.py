@@ -22,6 +22,7 @@ from eisp_data.errors import DataError
 from eisp_data.storage.episodes import read_parquet
 from eisp_data.storage.files import WriterLock, one_line, read_json
 from eisp_data.storage.meta import SIDECAR_PATH
+from eisp_data.storage.pages import recover_rows
 from eisp_data.storage.reader import build_episode
 from eisp_data.storage.rewrite import Rewriter
 from eisp_data.storage.rows import as_table, column_values, read_rows
@@ -87,7 +88,7 @@ def repair(root: Path | str, to: Path | None = None, in_place: bool = False) -> 
     try:
         report = RepairReport(copy, root)
         spec, recipe = _shared(root)
-        pointers = _pointers(root, spec)
+        pointers = _pointers(root)
         with Rewriter(copy, spec, recipe) as rewriter:
             for found in _find(root, spec, pointers, report.lost):
                 try:
@@ -115,14 +116,12 @@ def _shared(root: Path) -> tuple[DatasetSpec, dict[str, Any]]:
     except (DataError, KeyError, TypeError, ValueError):
         pass
     for path in _data_files(root):
-        for _, table in _row_groups(path, [SIDECAR_COLUMN], []):
-            for text in table[SIDECAR_COLUMN].to_pylist():
-                if text:
-                    try:
-                        sidecar = decode(text, str(path))
-                    except DataError:
-                        continue
-                    return sidecar.spec, sidecar.recipe
+        try:
+            texts = read_rows(path, [SIDECAR_COLUMN])[SIDECAR_COLUMN].to_pylist()
+            sidecar = decode(next(filter(None, texts), ""), str(path))
+        except DataError:
+            continue
+        return sidecar.spec, sidecar.recipe
     raise DataError(f"{root}: no episode of it can be read; nothing can be repaired")
 
 
@@ -131,37 +130,17 @@ def _data_files(root: Path) -> list[Path]:
     return sorted(p for p in named if p.parent.name[6:].isdigit() and p.stem[5:].isdigit())
 
 
-def _row_groups(path: Path, columns: list[str], lost: list[str]) -> Iterator[tuple[int, pa.Table]]:
-    """Yield the first row and the table of each row group that can be read."""
-    try:
-        metadata = pq.read_metadata(path)
-        rows = [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)]
-    except (OSError, pa.ArrowException) as error:
-        lost.append(f"{path}: {one_line(error)}")
-        return
-    first = 0
-    for number, count in enumerate(rows):
-        try:
-            table = read_rows(path, columns, number)
-            if table.num_rows != count:
-                raise DataError(f"{path}: {table.num_rows} rows of {count}")
-            yield first, table
-        except DataError as error:
-            lost.append(f"rows {first} to {first + count - 1} of {error}")
-        first += count
-
-
-def _pointers(root: Path, spec: DatasetSpec) -> dict[int, dict[str, Any]]:
-    """Return the rows of ``meta/episodes`` that can be read, by episode, where videos need them."""
+def _pointers(root: Path) -> dict[int, dict[str, Any]]:
+    """Return the rows of ``meta/episodes`` that can be read, by episode, without statistics."""
     found: dict[int, dict[str, Any]] = {}
-    for path in sorted((root / "meta/episodes").glob("*/*.parquet")) if spec.cameras else ():
+    for path in sorted((root / "meta/episodes").glob("*/*.parquet")):
         try:
             table = read_parquet(path)
         except DataError:
             continue
-        names = [n for n in table.column_names if n.startswith("videos/")]
         if "episode_index" in table.column_names:
-            for row in table.select(["episode_index", *names]).to_pylist():
+            names = [n for n in table.column_names if not n.startswith("stats/")]
+            for row in table.select(names).to_pylist():
                 found.setdefault(row["episode_index"], row)
     return found
 
@@ -170,30 +149,67 @@ def _find(
     root: Path, spec: DatasetSpec, pointers: dict[int, dict[str, Any]], lost: list[str]
 ) -> Iterator[_Found]:
     """Yield the whole episodes of a dataset; those that are not get a line in ``lost``."""
-    kinds = column_widths(spec)
     for path in _data_files(root):
-        for first, table in _row_groups(path, [*kinds, SIDECAR_COLUMN], lost):
+        for first_row, own, text in _candidates(path, spec, pointers, lost):
+            where = f"{path}: episode {own['episode_index'][0]}"
             try:
-                columns = {n: column_values(table, n, *kind, path) for n, kind in kinds.items()}
-                texts = table[SIDECAR_COLUMN].to_pylist()
+                sidecar = _check(own, text, spec, where)
+                videos = _locate(root, spec, path, own, first_row, pointers)
+                _check_video(videos, sidecar)
             except DataError as error:
-                lost.append(f"rows {first} to {first + table.num_rows - 1}: {error}")
+                known = str(error).startswith(str(path))
+                lost.append(str(error) if known else f"{where}: {error}")
                 continue
-            numbers = columns["episode_index"]
-            edges = np.flatnonzero(np.diff(numbers)) + 1
-            for start, stop in zip([0, *edges], [*edges, len(numbers)], strict=True):
-                where = f"{path}: episode {numbers[start]}"
+            yield _Found(own, text, videos)
+
+
+def _candidates(
+    path: Path, spec: DatasetSpec, pointers: dict[int, dict[str, Any]], lost: list[str]
+) -> Iterator[tuple[int, dict[str, np.ndarray], str]]:
+    """Yield first row in the file, columns and sidecar string of what may be an episode."""
+    try:
+        metadata = pq.read_metadata(path)
+        counts = [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)]
+    except (OSError, pa.ArrowException) as error:
+        lost.append(f"the footer of {path}: {one_line(error)}")
+        yield from _without_footer(path, spec, pointers, lost)
+        return
+    kinds = column_widths(spec)
+    first = 0
+    for number, count in enumerate(counts):
+        try:
+            table = read_rows(path, [*kinds, SIDECAR_COLUMN], number)
+            columns = {n: column_values(table, n, *kind, path) for n, kind in kinds.items()}
+            texts = table[SIDECAR_COLUMN].to_pylist()
+        except DataError as error:
+            lost.append(f"rows {first} to {first + count - 1} of {error}")
+        else:
+            edges = np.flatnonzero(np.diff(columns["episode_index"])) + 1
+            for start, stop in zip([0, *edges], [*edges, len(texts)], strict=True):
                 own = {name: values[start:stop] for name, values in columns.items()}
-                try:
-                    sidecar = _check(own, texts[start], spec, where)
-                    videos = _locate(root, spec, path, own, first + int(start), pointers)
-                    _check_video(videos, sidecar)
-                except DataError as error:
-                    lost.append(
-                        str(error) if str(error).startswith(str(path)) else f"{where}: {error}"
-                    )
-                    continue
-                yield _Found(own, texts[start], videos)
+                yield first + int(start), own, texts[start]
+        first += count
+
+
+def _without_footer(
+    path: Path, spec: DatasetSpec, pointers: dict[int, dict[str, Any]], lost: list[str]
+) -> Iterator[tuple[int, dict[str, np.ndarray], str]]:
+    """Yield what can be read from the pages themselves, given how long each episode is."""
+    place = int(path.parent.name[6:]), int(path.stem[5:])
+    expected = sorted(
+        number
+        for number, row in pointers.items()
+        if (row.get("data/chunk_index"), row.get("data/file_index")) == place
+    )
+    lengths = [int(pointers[number].get("length") or 0) for number in expected]
+    first = found = 0
+    for columns, text in recover_rows(path, spec, lengths):
+        yield first, columns, text
+        first += lengths[found]
+        found += 1
+    lost += [
+        f"{path}: episode {number}: the file ends before it does" for number in expected[found:]
+    ]
 
 
 def _check(own: dict[str, np.ndarray], text: str, spec: DatasetSpec, where: str) -> Sidecar:

@@ -34,7 +34,7 @@ def write_rows(
     arrays[SIDECAR_COLUMN] = pa.array(texts)
     table = pa.table(arrays)
     # Measured values hardly repeat: a dictionary of them costs time and saves nothing.
-    plain = [n for n, v in columns.items() if v.dtype.kind == "f" and "desired" not in n]
+    plain = [name for name, values in columns.items() if values.dtype.kind == "f"]
     with pq.ParquetWriter(
         path,
         table.schema,

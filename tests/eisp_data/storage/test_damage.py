@@ -52,14 +52,36 @@ class TestEachKindOfDamage:
         assert failed(root) == {"episode count", "frame count"}
         assert failed(repair(root).copy) == set()
 
-    def test_a_missing_footer_costs_the_episodes_of_its_file(self, make_dataset):
-        root, episodes = make_dataset()
+    def test_a_missing_footer_costs_no_episode_that_is_there(self, make_dataset):
+        root, episodes = make_dataset(cameras=True)
         path = root / "data/chunk-000/file-001.parquet"
-        path.write_bytes(path.read_bytes()[:-100])
+        data, footer = path.read_bytes(), int.from_bytes(path.read_bytes()[-8:-4], "little")
+        path.write_bytes(data[: -8 - footer])
         assert "rows" in failed(root)
         report = repair(root)
-        assert report.episodes == 2 and any("file-001.parquet" in line for line in report.lost)
-        for ours, theirs in zip(episodes[:2], read_episodes(report.copy), strict=True):
+        assert report.episodes == 5 and len(report.lost) == 1 and "the footer of" in report.lost[0]
+        for ours, theirs in zip(episodes, read_episodes(report.copy, images=True), strict=True):
+            assert_same(ours, theirs)
+
+    def test_a_file_cut_in_an_episode_keeps_those_before(self, make_dataset):
+        root, episodes = make_dataset()
+        path = root / "data/chunk-000/file-001.parquet"
+        group = pq.read_metadata(path).row_group(2)
+        path.write_bytes(path.read_bytes()[: group.column(5).data_page_offset])
+        report = repair(root)
+        assert report.lost[1:] == [f"{path}: episode 4: the file ends before it does"]
+        for ours, theirs in zip(episodes[:4], read_episodes(report.copy), strict=True):
+            assert_same(ours, theirs)
+
+    def test_long_episodes_of_many_pages_are_found_without_a_footer(self, tmp_path):
+        spec = spec_of(sim_state_dim=60)
+        episodes = [random_episode(spec, steps, steps) for steps in (3, 25_000, 40)]
+        with DatasetWriter(tmp_path / "d", spec, {}) as writer:
+            writer.write(episodes)
+        path = tmp_path / "d/data/chunk-000/file-000.parquet"
+        path.write_bytes(path.read_bytes()[:-8])
+        report = repair(tmp_path / "d")
+        for ours, theirs in zip(episodes, read_episodes(report.copy), strict=True):
             assert_same(ours, theirs)
 
     def test_a_half_written_last_episode(self, make_dataset):
