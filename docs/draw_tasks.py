@@ -1,6 +1,6 @@
 """Draw docs/tasks.png: each task in the middle of an episode of its oracle, with its goal.
 
-    python docs/draw_tasks.py
+python docs/draw_tasks.py
 """
 
 from __future__ import annotations
