@@ -32,19 +32,16 @@ class Physics:
         self._pool = Rollout(nthread=threads if threads > 1 else 0)
 
     def step(self, state: np.ndarray, control: np.ndarray) -> np.ndarray:
-        """Apply one control for one control period in every world.
+        """Apply the controls of one control period in every world.
 
         Args:
             state: (N, P) float64.
-            control: (N, U) float64, in the units of the model's actuators, held for the whole
-                period; or (N, SUBSTEPS, U), one for each time step.
+            control: (N, SUBSTEPS, U) float64, in the units of the model's actuators.
 
         Returns:
             (N, P) float64, the states SUBSTEPS time steps later.
         """
         worlds = len(state)
-        if control.ndim == 2:
-            control = np.repeat(control[:, None], SUBSTEPS, axis=1)
         path = np.empty((worlds, SUBSTEPS, self.state_dim))
         sensors = np.empty((worlds, SUBSTEPS, self.model.nsensordata))
         self._pool.rollout(

@@ -15,7 +15,13 @@ import numpy as np
 
 from eisp_data.sim.physics import Physics
 from eisp_data.sim.rotation import euler_from_quaternion, rotate
-from eisp_data.sim.scene import FINGER_TRAVEL_M, WORKSPACE_HIGH_M, WORKSPACE_LOW_M
+from eisp_data.sim.scene import (
+    FINGER_TRAVEL_M,
+    SUBSTEPS,
+    TIMESTEP_S,
+    WORKSPACE_HIGH_M,
+    WORKSPACE_LOW_M,
+)
 from eisp_data.tasks.paper import PaperSettings
 
 GRIPPER_DIM = 10
@@ -103,21 +109,30 @@ class Task(ABC):
         )
 
     def control(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
-        """Turn (N, 4) actions in [-1, 1] into (N, 5) servo targets.
+        """Turn (N, 4) actions in [-1, 1] into (N, SUBSTEPS, 5) servo targets.
 
         The first three move the gripper relative to where it is, within the workspace; the fourth
-        opens (1) or closes (-1) the fingers.
+        opens (1) or closes (-1) the fingers. Within a control period the gripper's targets move at
+        one speed, ahead by the servo's own lag: one that jumps would make the fingers lunge.
         """
         action = np.clip(action, -1.0, 1.0)
-        target = np.empty((len(state), _GRIPPER_JOINTS))
-        target[:, :3] = np.clip(
-            self.qpos(state)[:, :3] + ACTION_SCALE_M * action[:, :3],
-            WORKSPACE_LOW_M,
-            WORKSPACE_HIGH_M,
+        start = self.qpos(state)[:, None, :3]
+        target = np.clip(
+            start + ACTION_SCALE_M * action[:, None, :3], WORKSPACE_LOW_M, WORKSPACE_HIGH_M
         )
-        opening = 0.0 if self.fingers_closed else (action[:, 3:] + 1.0) / 2.0
-        target[:, 3:] = FINGER_TRAVEL_M * opening
-        return target
+        passed = np.arange(1, SUBSTEPS + 1)[:, None] / SUBSTEPS
+        path = np.empty((len(state), SUBSTEPS, _GRIPPER_JOINTS))
+        ahead = start + (target - start) * (passed + self._servo_lag)
+        path[..., :3] = np.clip(ahead, WORKSPACE_LOW_M, WORKSPACE_HIGH_M)
+        opening = 0.0 if self.fingers_closed else (action[:, None, 3:] + 1.0) / 2.0
+        path[..., 3:] = FINGER_TRAVEL_M * opening
+        return path
+
+    @property
+    def _servo_lag(self) -> float:
+        """Damping by stiffness of the gripper's servo, in control periods."""
+        _, stiffness, damping = -self.model.actuator_biasprm[0, :3]
+        return float(damping / stiffness / (TIMESTEP_S * SUBSTEPS))
 
     def observe(self, state: np.ndarray) -> np.ndarray:
         """Return the (N, S) float32 observations of (N, P) states."""

@@ -6,8 +6,7 @@ import mujoco
 import numpy as np
 
 from eisp_data.sim.drawer import HANDLE_CLOSED_M, drawer_model
-from eisp_data.tasks.base import AT_REST_M_S, GRIPPER_DIM, OBJECT_DIM, ObjectSlot
-from eisp_data.tasks.steady import SteadyTask
+from eisp_data.tasks.base import AT_REST_M_S, GRIPPER_DIM, OBJECT_DIM, ObjectSlot, Task
 
 _DRAWER = 5
 """Index of the drawer's slide in qpos and qvel."""
@@ -18,7 +17,7 @@ def handle_at(opening_m: float) -> np.ndarray:
     return np.array(HANDLE_CLOSED_M) - [opening_m, 0.0, 0.0]
 
 
-class DrawerTask(SteadyTask):
+class DrawerTask(Task):
     """Goal ``[block 3, handle 3]``, observation ``[gripper, block, handle, slide 2]``."""
 
     blocks = 1

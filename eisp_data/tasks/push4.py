@@ -7,8 +7,8 @@ import numpy as np
 
 from eisp_data.sim.scene import BLOCK_SIZE_M, table_model
 from eisp_data.tasks import paper
+from eisp_data.tasks.base import Task
 from eisp_data.tasks.placement import scatter
-from eisp_data.tasks.steady import SteadyTask
 from eisp_data.tasks.ways import on_the_way
 
 PUSH_LOW_M = (0.235, -0.145)
@@ -23,7 +23,7 @@ _TANGLED_SHARE = 0.5
 """Share of the episodes in which a block may lie in another's way, or on its goal."""
 
 
-class Push4(SteadyTask):
+class Push4(Task):
     """Each block belongs at its own place; some have to be pushed in a certain order.
 
     There is always an order in which straight pushes do it. In some of the episodes any order

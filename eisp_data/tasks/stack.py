@@ -7,14 +7,14 @@ import numpy as np
 
 from eisp_data.sim.scene import BLOCK_SIZE_M, table_model
 from eisp_data.tasks import paper
+from eisp_data.tasks.base import Task
 from eisp_data.tasks.placement import scatter
-from eisp_data.tasks.steady import SteadyTask
 
 _SEPARATION_M = 0.10
 """An open finger fits beside every block."""
 
 
-class Stack(SteadyTask):
+class Stack(Task):
     """Block i belongs on level i of a tower at a random place; all start apart on the table."""
 
     name = "stack"

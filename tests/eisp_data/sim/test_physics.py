@@ -8,6 +8,7 @@ import pytest
 
 from eisp_data.policies.registry import SCRIPTS
 from eisp_data.policies.script import Noise, ScriptedPolicy
+from eisp_data.sim.scene import SUBSTEPS
 from eisp_data.sim.worlds import Worlds
 from eisp_data.tasks.registry import TASKS, get_task
 
@@ -27,7 +28,7 @@ def push_with_full_force(state: np.ndarray, target: list[float], steps: int) -> 
     physics = get_task("stack").physics(threads=1)
     path = []
     for _ in range(steps):
-        state = physics.step(state, np.array([target]))
+        state = physics.step(state, np.tile(target, (1, SUBSTEPS, 1)))
         path.append(state[0])
     return np.array(path)
 
