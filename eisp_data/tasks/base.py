@@ -122,8 +122,9 @@ class Task(ABC):
         )
         passed = np.arange(1, SUBSTEPS + 1)[:, None] / SUBSTEPS
         path = np.empty((len(state), SUBSTEPS, _GRIPPER_JOINTS))
-        ahead = start + (target - start) * (passed + self._servo_lag)
-        path[..., :3] = np.clip(ahead, WORKSPACE_LOW_M, WORKSPACE_HIGH_M)
+        path[..., :3] = start + (target - start) * (passed + self._servo_lag)
+        # Nor may it run ahead into the table.
+        path[..., 2] = np.maximum(path[..., 2], WORKSPACE_LOW_M[2])
         opening = 0.0 if self.fingers_closed else (action[:, None, 3:] + 1.0) / 2.0
         path[..., 3:] = FINGER_TRAVEL_M * opening
         return path
