@@ -6,7 +6,7 @@ from typing import Literal
 
 import pytest
 import yaml
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eisp_data.config import from_plain, load_yaml, save_yaml, to_plain
@@ -49,6 +49,7 @@ outers = st.builds(
 )
 
 
+@settings(max_examples=40, deadline=None)
 @given(outers)
 def test_a_configuration_comes_back_from_yaml_as_it_was(config):
     assert from_plain(Outer, yaml.safe_load(yaml.safe_dump(to_plain(config)))) == config
