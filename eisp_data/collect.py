@@ -14,7 +14,7 @@ from eisp_data.sim.gym_worlds import GymWorlds
 from eisp_data.sim.worlds import Worlds
 from eisp_data.tasks.base import Task, is_success
 
-_TAIL_STEPS = 10
+_TAIL_STEPS = 25
 """An episode goes on this long after its script has ended: what is falling comes to rest, and the
 data show what to do when all is done."""
 

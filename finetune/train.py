@@ -43,16 +43,19 @@ class Rollouts:
     worlds: AnyWorlds
     policy: SubgoalPolicy
     next_seed: int
+    solved: np.ndarray
+    """(N,) bool: at the end of the last round the goal was met."""
 
     def start(self, due: np.ndarray) -> None:
         """Start the named worlds anew."""
         seeds = self.next_seed + np.arange(len(due))
         self.worlds.reset(seeds, due)
         self.policy.reset(due)
+        self.solved[due] = False
         self.next_seed += len(due)
 
     def collect(self, steps: int) -> tuple[np.ndarray, ...]:
-        """Step all worlds, exploring; then start anew those that are over or have succeeded.
+        """Step all worlds, exploring; then start anew those that are over or solved for good.
 
         Returns:
             Observations, achieved goals and actions (R, ...), world after world, and the (N + 1,)
@@ -71,7 +74,10 @@ class Rollouts:
         last = worlds.observation.copy(), worlds.achieved_goal.copy(), np.zeros_like(action)
         lived = np.arange(steps + 1) < lengths[:, None]
         columns = [np.stack(column, 1)[lived] for column in zip(*rows, last, strict=True)]
-        self.start(np.flatnonzero(worlds.truncated | worlds.done | worlds.success))
+        # A success that lasted for a round is learned; one that is new has still to be kept.
+        over = worlds.truncated | worlds.done | (self.solved & worlds.success)
+        self.solved = worlds.success
+        self.start(np.flatnonzero(over))
         return *columns, np.concatenate([[0], np.cumsum(lengths)])
 
     def state(self) -> dict[str, np.ndarray]:
@@ -80,6 +86,7 @@ class Rollouts:
         return worlds | {
             "subgoal": self.policy.subgoal,
             "age": self.policy.age,
+            "solved": self.solved,
             "next_seed": np.array(self.next_seed),
         }
 
@@ -90,7 +97,7 @@ class Rollouts:
             {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
         )
         self.policy.subgoal, self.policy.age = arrays["subgoal"], arrays["age"]
-        self.next_seed = int(arrays["next_seed"])
+        self.next_seed, self.solved = int(arrays["next_seed"]), arrays["solved"]
 
 
 class Finetuner:
@@ -135,7 +142,12 @@ class Finetuner:
                 f"{worlds.episode_steps} steps of an episode"
             )
         policy = SubgoalPolicy(agent, config.worlds, device)
-        self._rollouts = Rollouts(worlds, policy, _TRAINING_SEED + seed * 10_000_000)
+        self._rollouts = Rollouts(
+            worlds,
+            policy,
+            _TRAINING_SEED + seed * 10_000_000,
+            np.zeros(config.worlds, bool),
+        )
         self._evaluation_worlds = make_worlds(min(100, config.evaluation_episodes))
         self._curve: list[dict[str, float]] = []
         self._round = 0

@@ -81,7 +81,7 @@ def test_a_block_in_the_way_blocks_the_drawer_and_one_beside_it_does_not(task, r
     errors = stuck.achieved_goal - stuck.desired_goal
     assert np.linalg.norm(errors, axis=1).min() > 0.08, "far from the goal without a push"
     free = pulled(task, np.flatnonzero(~in_way)[:10])
-    assert (task.openings(free.state) > TRAVEL_M - 0.005).all()
+    assert (task.openings(free.state) > TRAVEL_M - 0.01).all()
 
 
 def test_the_drawer_stays_where_it_is_left(task):
