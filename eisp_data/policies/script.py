@@ -50,8 +50,8 @@ class Noise:
     aim_std_m: float = 0.0
     """Standard deviation of the places that a script aims at, drawn anew for each."""
     blunder: float = 0.0
-    """Probability that an object is brought to a place up to 6 cm off in x and in y. What the script
-    then does about it is what a policy has to know in order to recover."""
+    """Probability that an object is brought to a place up to 6 cm off in x and in y. What the
+    script then does about it is what a policy has to know in order to recover."""
     slowest: float = 1.0
     """Each episode moves at a share of full speed drawn from [slowest, 1]."""
     slip: float = 0.0
