@@ -88,8 +88,9 @@ class Trajectories:
         goal = self.achieved_goal[source]
         self._displace(goal, rows, kind == 2, rng)
         start, after = self.achieved_goal[rows], self.achieved_goal[rows + 1]
-        reached = np.linalg.norm(after - goal, axis=1) <= mix.tolerance_m
         moved = np.linalg.norm(goal - start, axis=1) > _MOVED_M
+        goal += self._jitter(mix, goal.shape, rng)
+        reached = np.linalg.norm(after - goal, axis=1) <= mix.tolerance_m
         # What a trajectory does while nothing moves yet serves its next move, not this goal.
         at_end = (kind == 0) & (source == self._last[rows])
         clone = (kind < 2) & (moved | at_end)
@@ -133,7 +134,18 @@ class Trajectories:
             result[f"{name}_std"] = torch.from_numpy(std.astype(np.float32))
         return result
 
-    def subgoals(self, count: int, rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor]:
+    def _jitter(self, mix: GoalMix, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+        """Draw what is added to goals: errors of about half the tolerance in all.
+
+        Goals taken from a trajectory are met exactly, those of a rollout never: what is done well
+        enough must look done, and not like a place to correct.
+        """
+        std = mix.tolerance_m / (2.0 * self._layout.goal_dim**0.5)
+        return rng.normal(0.0, std, shape).astype(np.float32)
+
+    def subgoals(
+        self, count: int, mix: GoalMix, rng: np.random.Generator
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Draw what a generator learns from.
 
         Returns:
@@ -141,8 +153,9 @@ class Trajectories:
         """
         rows = self.leading[rng.integers(len(self.leading), size=count)]
         subgoal, goal = self.waypoints.subgoal_and_goal(rows, rng)
+        final = self.achieved_goal[goal]
         return (
             torch.from_numpy(self.observation[rows]),
-            torch.from_numpy(self.achieved_goal[goal]),
+            torch.from_numpy(final + self._jitter(mix, final.shape, rng)),
             torch.from_numpy(self.achieved_goal[subgoal]),
         )

@@ -94,7 +94,7 @@ def update_generator(
 ) -> dict[str, Tensor]:
     """Update the generator on hindsight subgoals."""
     device = agent.bank.device
-    sample = (tensor.to(device) for tensor in data.subgoals(count, rng))
+    sample = (tensor.to(device) for tensor in data.subgoals(count, agent.config.mix, rng))
     loss, info = agent.proposer.loss(*sample)
     optimizer.zero_grad(set_to_none=True)
     loss.backward()
@@ -111,7 +111,7 @@ def validate(agent: Agent, held_out: Trajectories, device: str) -> dict[str, Ten
     no object is further than 5 cm from where it was in some arrangement of the bank.
     """
     rng = np.random.default_rng(0)
-    sample = held_out.subgoals(_VALIDATION_SAMPLES, rng)
+    sample = held_out.subgoals(_VALIDATION_SAMPLES, agent.config.mix, rng)
     observation, goal, subgoal = (tensor.to(device) for tensor in sample)
     _, info = agent.proposer.loss(observation, goal, subgoal)
     proposed = agent.proposer.propose(observation, goal, 1)[0][:, 0]
