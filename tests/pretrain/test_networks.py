@@ -1,0 +1,41 @@
+"""Perceptrons in an ensemble."""
+
+import pytest
+import torch
+from torch import nn
+
+from pretrain.networks import EnsembleMLP, mlp
+
+
+@pytest.mark.parametrize("layer_norm", [False, True])
+def test_an_ensemble_computes_what_its_members_would_alone(layer_norm):
+    torch.manual_seed(0)
+    ensemble = EnsembleMLP(3, 5, (7, 6), layer_norm=layer_norm)
+    inputs = torch.randn(4, 5)
+    values = ensemble(inputs)
+    assert values.shape == (3, 4)
+    for member in range(3):
+        hidden = inputs
+        for index, (weight, bias) in enumerate(zip(ensemble.weights, ensemble.biases, strict=True)):
+            hidden = hidden @ weight[member] + bias[member]
+            if index < 2:
+                hidden = nn.functional.layer_norm(hidden, hidden.shape[-1:]) if layer_norm else (
+                    hidden
+                )  # fmt: skip
+                hidden = hidden.relu()
+        torch.testing.assert_close(values[member], hidden[:, 0])
+
+
+def test_the_members_of_an_ensemble_learn_apart():
+    torch.manual_seed(0)
+    ensemble = EnsembleMLP(2, 3, (4,), layer_norm=True)
+    ensemble(torch.randn(8, 3))[0].sum().backward()
+    for parameter in (*ensemble.weights, *ensemble.biases):
+        assert parameter.grad is not None
+        assert (parameter.grad[0] != 0).any() and (parameter.grad[1] == 0).all()
+
+
+def test_a_perceptron_without_hidden_layers_is_linear():
+    assert [type(module) for module in mlp(3, (), 2)] == [nn.Linear]
+    kinds = [nn.Linear, nn.ReLU, nn.Linear, nn.ReLU, nn.Linear]
+    assert [type(module) for module in mlp(3, (5, 4), 2)] == kinds
