@@ -149,9 +149,7 @@ def _batch(
         if watch:
             watch(worlds, policy)
     distance = np.linalg.norm(worlds.achieved_goal - policy.subgoal, axis=1)
-    # Copied, because foreign worlds overwrite what they have shown.
-    last = worlds.success.copy()
-    return last, last & worlds.settled, some, returns, distance
+    return worlds.success, worlds.success & worlds.settled, some, returns, distance
 
 
 def oracle_return(name: str, episodes: int, seed: int) -> float | None:

@@ -65,18 +65,17 @@ class Rollouts:
         rows: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         lengths = np.ones(worlds.count, np.int64)
         for _ in range(steps):
-            # Foreign worlds overwrite what they have shown.
-            observation, achieved = worlds.observation.copy(), worlds.achieved_goal.copy()
+            observation, achieved = worlds.observation, worlds.achieved_goal
             action = self.policy.act(observation, achieved, worlds.desired_goal, explore=True)
             rows.append((observation, achieved, action))
             lengths += ~(worlds.done | worlds.truncated)
             worlds.step(action)
-        last = worlds.observation.copy(), worlds.achieved_goal.copy(), np.zeros_like(action)
+        last = worlds.observation, worlds.achieved_goal, np.zeros_like(action)
         lived = np.arange(steps + 1) < lengths[:, None]
         columns = [np.stack(column, 1)[lived] for column in zip(*rows, last, strict=True)]
         # A success that lasted for a round is learned; one that is new has still to be kept.
         over = worlds.truncated | worlds.done | (self.solved & worlds.success)
-        self.solved = worlds.success
+        self.solved = worlds.success.copy()
         self.start(np.flatnonzero(over))
         return *columns, np.concatenate([[0], np.cumsum(lengths)])
 

@@ -71,6 +71,7 @@ class GymWorlds:
     def reset(self, seeds: Sequence[int] | np.ndarray, worlds: np.ndarray | None = None) -> None:
         """Start the named worlds (all, if left out) anew, each from its own seed."""
         indices = np.arange(self.count) if worlds is None else np.asarray(worlds)
+        self._turn_page()
         for index, seed in zip(indices, seeds, strict=True):
             seen, info = self._envs[index].reset(seed=int(seed))
             self._see(index, seen, info)
@@ -84,8 +85,14 @@ class GymWorlds:
         A world that is over is left as it is until its reset.
         """
         exact = np.asarray(action, np.float32)  # what a snapshot holds is what was done
+        self._turn_page()
         for index in np.flatnonzero(~self.done & ~self.truncated):
             self._step(index, exact[index])
+
+    def _turn_page(self) -> None:
+        """Go on in new arrays: who has taken one keeps what it was shown, as with ``Worlds``."""
+        for name in (*_PARTS, "success", "done"):
+            setattr(self, name, getattr(self, name).copy())
 
     def _step(self, index: int, action: np.ndarray) -> None:
         scaled = self._centre + self._half * np.clip(action, -1.0, 1.0)
