@@ -1,0 +1,89 @@
+"""``eisp-finetune`` and ``eisp-eval`` from the command line."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from finetune.cli import evaluate, finetune
+
+SMALL = [
+    "--online.rounds", "1", "--online.worlds", "2", "--online.updates", "2",
+    "--online.batch-size", "8", "--online.evaluation-episodes", "1",
+    "--device", "cpu", "--threads", "1",
+]  # fmt: skip
+
+
+def run(monkeypatch: pytest.MonkeyPatch, command, *words: object) -> None:
+    monkeypatch.setattr(sys, "argv", ["eisp", *map(str, words)])
+    command.main()
+
+
+def mistake(monkeypatch, capsys, command, *words: object) -> str:
+    """Return the one line that a command says before it exits with status 2."""
+    with pytest.raises(SystemExit) as caught:
+        run(monkeypatch, command, *words)
+    assert caught.value.code == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: ") and said.count("\n") == 1
+    return said
+
+
+def test_a_policy_is_fine_tuned_resumed_and_evaluated(pretrained, tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "run"
+    run(monkeypatch, finetune, "--policy.path", pretrained, "--output-dir", folder, *SMALL)
+    said = capsys.readouterr().out
+    assert "success before" in said and f"policy: {folder / 'best'}" in said
+    run(monkeypatch, finetune, "--output-dir", folder, "--resume", "--online.rounds", "2")
+    assert "rounds: 2" in (folder / "finetune.yaml").read_text()
+    assert "worlds: 2" in (folder / "finetune.yaml").read_text()
+    capsys.readouterr()
+    words = ["--policy.path", folder, "--episodes", "2", "--device", "cpu", "--threads", "1"]
+    run(monkeypatch, evaluate, *words, "--json")
+    figures = json.loads(capsys.readouterr().out)
+    assert (figures["task"], figures["episodes"], figures["seed"]) == ("stack", 2, 1000)
+    assert figures["oracle_return"] < 0 and figures["paper_return"] == -89.29
+    for name in ("success_last", "success_any", "success_settled", "return", "relative_return"):
+        estimate = figures[name]
+        assert estimate["low"] <= estimate["mean"] <= estimate["high"]
+    run(monkeypatch, evaluate, *words)
+    table = capsys.readouterr().out
+    assert table.startswith("stack: 2 episodes from seed 1000")
+    assert all(row in table for row in ("success at the last step", "relative to the oracle"))
+
+
+@pytest.mark.parametrize(
+    ("command", "words", "said"),
+    [
+        (finetune, [], "give --policy.path"),
+        (finetune, ["--policy.path", "nowhere"], "nowhere holds no policy"),
+        (finetune, ["--policy.path", "RUN", "--online.round", "3"], "mean --online.rounds?"),
+        (finetune, ["--policy.path", "RUN", "--env.id", "FetchReach-v4"], "a policy of 'stack'"),
+        (finetune, ["--policy.path", "RUN", "--subgoals.source", "magic"], "magic"),
+        (finetune, ["--policy.path", "RUN", "--online.worlds", "0"], "must be at least 1; got 0"),
+        (finetune, ["--resume"], "--resume: give --output-dir"),
+        (evaluate, [], "missing --policy.path"),
+        (evaluate, ["--policy.path", "nowhere"], "nowhere holds no policy"),
+        (evaluate, ["--policy.path", "RUN", "--episodes", "0"], "--episodes must be at least 1"),
+        (evaluate, ["--policy.path", "RUN", "--seed", "-4"], "--seed must be at least 0; got -4"),
+        (evaluate, ["--policy.path", "RUN", "--episode", "1"], "did you mean --episodes?"),
+    ],
+)
+def test_mistakes_are_told_in_one_line(
+    pretrained, tmp_path, monkeypatch, capsys, command, words, said
+):
+    monkeypatch.chdir(tmp_path)
+    words = [str(pretrained) if word == "RUN" else word for word in words]
+    assert said in mistake(monkeypatch, capsys, command, *words)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("module", ["finetune", "evaluate"])
+@pytest.mark.parametrize("words", [["--what"], ["--policy.path", "nowhere"]])
+def test_the_process_exits_with_status_2_and_one_line(module, words):
+    program = f"from finetune.cli.{module} import main; main()"
+    command = [sys.executable, "-c", program, *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2 and done.stdout == ""
+    assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1

@@ -1,0 +1,290 @@
+"""Online fine-tuning of a small policy in Stack, interrupted and not."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from learning_samples import linear_agent
+from safetensors.torch import load_file
+
+from eisp_data.cli.collect import CollectConfig, collect
+from eisp_data.errors import ConfigError, DataError
+from eisp_data.sim.gym_worlds import GymWorlds
+from finetune.config import DataConfig, EnvConfig, FinetuneConfig, OnlineConfig, PolicyConfig
+from finetune.rollout import SubgoalPolicy
+from finetune.run import finetune
+from finetune.train import Rollouts, summarise
+from pretrain import checkpoint
+from pretrain.config import SubgoalConfig
+from pretrain.saved import saved_subgoals
+
+SMALL = OnlineConfig(
+    rounds=2,
+    worlds=2,
+    round_steps=50,
+    updates=4,
+    batch_size=16,
+    generator_every=2,
+    generator_batch_size=16,
+    evaluate_every=1,
+    evaluation_episodes=1,
+)
+
+
+class Killed(BaseException):
+    """The process ends here."""
+
+
+def tiny_finetuning(pretrained: Path, output_dir: Path, **online: object) -> FinetuneConfig:
+    return FinetuneConfig(
+        output_dir,
+        PolicyConfig(pretrained),
+        subgoals=saved_subgoals(pretrained),
+        online=replace(SMALL, **online),  # type: ignore[arg-type]
+        device="cpu",
+        threads=1,
+    )
+
+
+@pytest.fixture(scope="module")
+def finished(pretrained: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that nothing interrupted; not to be changed."""
+    run = tmp_path_factory.mktemp("finetuned") / "run"
+    finetune(tiny_finetuning(pretrained, run))
+    return run
+
+
+def metrics_of(run: Path) -> list[dict[str, float]]:
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    return [{k: v for k, v in line.items() if k != "wall_s"} for line in lines]
+
+
+def assert_same_run(ours: Path, theirs: Path) -> None:
+    assert metrics_of(ours) == metrics_of(theirs)
+    assert (ours / "summary.json").read_text() == (theirs / "summary.json").read_text()
+    for policy in ("checkpoints/last/pretrained_model", "best/pretrained_model"):
+        a, b = (load_file(run / policy / "model.safetensors") for run in (ours, theirs))
+        assert all(torch.equal(a[name], b[name]) for name in a | b)
+
+
+def test_a_run_keeps_its_history_and_logs_each_evaluation(finished, pretrained):
+    lines = metrics_of(finished)
+    before = [line for line in lines if line["stage"] == "pretrain"]
+    online = [line for line in lines if line["stage"] == "finetune"]
+    assert before == metrics_of(pretrained) and lines == before + online
+    assert [line["env_steps"] for line in online] == [0, 100, 200]
+    assert [line["updates"] for line in online] == [0, 4, 8]
+    assert all(0 <= line["eval/success_last"] <= line["eval/success_any"] for line in online)
+    assert {"train/critic_loss", "train/log_likelihood"} <= set(online[1])
+    assert (finished / "finetune.yaml").is_file() and (finished / "summary.json").is_file()
+
+
+def test_learning_moves_actor_critic_and_generator(finished, pretrained):
+    before, after = (
+        load_file(run / "checkpoints/last/pretrained_model/model.safetensors")
+        for run in (pretrained, finished)
+    )
+    for part in ("sac.actor.body", "sac.critic.body", "sac.target.body", "proposer"):
+        names = [name for name in before if name.startswith(part)]
+        assert names and any(not torch.equal(before[name], after[name]) for name in names)
+    assert torch.equal(before["bank"], after["bank"])
+
+
+def test_a_run_that_is_interrupted_and_resumed_ends_like_one_that_is_not(
+    finished, pretrained, tmp_path, monkeypatch
+):
+    config = tiny_finetuning(pretrained, tmp_path / "run")
+    save = checkpoint.save
+
+    def save_and_die(run: Path, at: int, *args: object) -> None:
+        save(run, at, *args)  # type: ignore[arg-type]
+        if at == 1:
+            raise Killed
+
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "save", save_and_die)
+        with pytest.raises(Killed):
+            finetune(config)
+    torch.manual_seed(99)
+    finetune(replace(config, resume=True))
+    assert_same_run(tmp_path / "run", finished)
+
+
+def test_a_process_that_is_really_killed_goes_on_as_if_it_had_not_been(
+    finished, pretrained, tmp_path
+):
+    run = tmp_path / "run"
+    flags = {f"--online.{k.replace('_', '-')}": v for k, v in vars(SMALL).items()}
+    words = ["--policy.path", pretrained, "--output-dir", run, "--device", "cpu", "--threads", "1"]
+    words += [part for pair in flags.items() for part in pair]
+    program = "from finetune.cli.finetune import main; main()"
+    process = subprocess.Popen(
+        [sys.executable, "-c", program, *map(str, words)],
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )  # fmt: skip
+    wait_for(lambda: (run / "checkpoints/000001").exists() or process.poll() is not None)
+    process.send_signal(signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL
+    assert not (run / "summary.json").exists()
+    finetune(replace(tiny_finetuning(pretrained, run), resume=True))
+    assert_same_run(run, finished)
+
+
+def wait_for(happened: Callable[[], bool]) -> None:
+    while not happened():
+        time.sleep(0.005)
+
+
+def test_a_run_that_is_killed_before_its_first_checkpoint_starts_over(
+    finished, pretrained, tmp_path, monkeypatch
+):
+    config = tiny_finetuning(pretrained, tmp_path / "run")
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "save", lambda *_: (_ for _ in ()).throw(Killed))
+        with pytest.raises(Killed):
+            finetune(config)
+    finetune(replace(config, resume=True))
+    assert_same_run(tmp_path / "run", finished)
+
+
+@pytest.mark.parametrize("source", ["random", "none"])
+def test_the_same_commands_show_what_the_subgoals_are_worth(pretrained, tmp_path, source):
+    config = tiny_finetuning(pretrained, tmp_path / "run", rounds=1)
+    summary = finetune(replace(config, subgoals=SubgoalConfig(source=source)))
+    assert set(summary) == {"offline_success", "dip", "recovery_steps", "best_success"}
+
+
+def test_a_generator_may_be_left_as_it_is(pretrained, tmp_path):
+    finetune(tiny_finetuning(pretrained, tmp_path / "run", rounds=1, generator_every=0))
+    before, after = (
+        load_file(run / "checkpoints/last/pretrained_model/model.safetensors")
+        for run in (pretrained, tmp_path / "run")
+    )
+    names = [name for name in before if name.startswith("proposer")]
+    assert all(torch.equal(before[name], after[name]) for name in names)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"policy": PolicyConfig()}, "give --policy.path, a pretrained policy, or --env.id"),
+        ({"policy": PolicyConfig(Path("nowhere"))}, "nowhere holds no policy"),
+        ({"env": EnvConfig("FetchReach-v4")}, "is a policy of 'stack', not 'FetchReach-v4'"),
+        ({"dataset": DataConfig(Path("nowhere"))}, "nowhere: not a LeRobot dataset"),
+        ({"online": replace(SMALL, round_steps=7)}, "--online.round-steps 7 must divide the 300"),
+        ({"online": replace(SMALL, worlds=0)}, "--online.worlds must be at least 1; got 0"),
+        ({"online": replace(SMALL, evaluate_every=0)}, "--online.evaluate-every must be at least"),
+        ({"online": replace(SMALL, replay_size=50)}, "--online.replay-size must be at least 51"),
+        ({"online": replace(SMALL, offline_share=1.5)}, "--online.offline-share must be 0 to 1"),
+        ({"subgoals": SubgoalConfig(every_steps=0)}, "--subgoals.every-steps must be at least 1"),
+        ({"seed": -1}, "--seed must be at least 0; got -1"),
+        ({"resume": True}, "holds no run, finetune.yaml is missing"),
+    ],
+)
+def test_what_cannot_be_run_is_told_and_leaves_nothing_behind(pretrained, tmp_path, changes, said):
+    config = replace(tiny_finetuning(pretrained, tmp_path / "run"), **changes)
+    with pytest.raises((ConfigError, DataError)) as caught:
+        finetune(config)
+    assert said in str(caught.value) and "\n" not in str(caught.value)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_dataset_of_another_task_is_refused(pretrained, tmp_path):
+    root = tmp_path / "push4"
+    collect(CollectConfig(root, task="push4", policy="random", episodes=1, workers=1))
+    config = tiny_finetuning(pretrained, tmp_path / "run")
+    with pytest.raises(DataError, match="is a dataset of 'push4', the policy one of 'stack'"):
+        finetune(replace(config, dataset=DataConfig(root)))
+    assert not (tmp_path / "run").exists()
+
+
+def rollouts(env_id: str, count: int = 3, source: str = "none") -> Rollouts:
+    worlds = GymWorlds(f"line_env:{env_id}", count)
+    agent = linear_agent(subgoals=SubgoalConfig(source=source, candidates=1))
+    policy = SubgoalPolicy(agent, count)
+    started = Rollouts(worlds, policy, next_seed=101, solved=np.zeros(count, bool))
+    torch.manual_seed(0)
+    started.start(np.arange(count))
+    return started
+
+
+def test_collected_rows_are_what_happened():
+    observation, achieved, action, starts = rollouts("Line-v0").collect(5)
+    assert starts.tolist() == [0, 6, 12, 18]
+    np.testing.assert_array_equal(observation, achieved)
+    for first, stop in zip(starts, starts[1:], strict=False):
+        moved = np.diff(achieved[first:stop], axis=0)
+        np.testing.assert_allclose(moved[:, 0], 0.05 * action[first : stop - 1, 0], atol=1e-6)
+        assert (moved[:, 1] == 0).all() and (action[stop - 1] == 0).all()
+    assert len(np.unique(achieved[:, 0])) == len(achieved)
+
+
+def test_a_world_that_ends_early_leaves_no_rows_after_its_end():
+    started = rollouts("ShortLine-v0")
+    _, achieved, action, starts = started.collect(10)
+    assert np.diff(starts).tolist() == [5, 5, 5]
+    for first, stop in zip(starts, starts[1:], strict=False):
+        moved = np.diff(achieved[first:stop, 0])
+        np.testing.assert_allclose(moved, 0.05 * action[first : stop - 1, 0], atol=1e-6)
+    assert started.worlds.steps.tolist() == [0, 0, 0]
+
+
+def test_worlds_start_anew_when_they_are_over_or_have_kept_a_success_for_a_round():
+    started = rollouts("Line-v0")
+    # The noise stays within 5 cm of where each began: 102 begins at its goal, 101 and 103 do not.
+    started.policy._agent.sac.actor.body[-1].bias.data[1] = -5.0
+    started.collect(2)
+    assert started.worlds.steps.tolist() == [2, 2, 2] and started.next_seed == 104
+    started.collect(2)
+    assert started.worlds.steps.tolist() == [4, 0, 4] and started.next_seed == 105
+    assert started.policy.age[1] == started.policy._config.every_steps
+    # The world that started anew had seed 104, an even one, and has to keep its success as well.
+    started.collect(6)
+    assert started.worlds.steps.tolist() == [0, 6, 0] and started.next_seed == 107
+
+
+def test_rollouts_go_on_from_their_state():
+    first, again = rollouts("Line-v0", source="random"), rollouts("Line-v0", source="random")
+    first.collect(3)
+    state = {name: value.copy() for name, value in first.state().items()}
+    torch.manual_seed(7)
+    expected = first.collect(4)
+    again.restore(state)
+    torch.manual_seed(7)
+    for a, b in zip(again.collect(4), expected, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert again.next_seed == first.next_seed
+
+
+def curve(*success: float) -> list[dict[str, float]]:
+    return [{"env_steps": 100 * i, "success_last": value} for i, value in enumerate(success)]
+
+
+@pytest.mark.parametrize(
+    ("success", "dip", "recovery_steps"),
+    [
+        ((0.5, 0.6, 0.7), 0.0, 0),
+        ((0.5, 0.3, 0.5, 0.9), 0.2, 200),
+        # From the last evaluation that was as good, over both dips, to the first after the lowest.
+        ((0.5, 0.6, 0.4, 0.5, 0.1, 0.3, 0.8), 0.4, 500),
+        ((0.5, 0.2, 0.4), 0.3, float("nan")),
+        ((0.0, 0.0, 0.3), 0.0, 0),
+        ((0.7,), 0.0, 0),
+    ],
+)
+def test_the_summary_tells_the_dip_and_the_steps_to_recover(success, dip, recovery_steps):
+    summary = summarise(curve(*success))
+    assert summary["offline_success"] == success[0]
+    assert summary["best_success"] == max(success)
+    assert summary["dip"] == pytest.approx(dip)
+    assert summary["recovery_steps"] == pytest.approx(recovery_steps, nan_ok=True)

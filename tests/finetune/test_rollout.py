@@ -1,0 +1,119 @@
+"""The rollout with subgoals: when they are renewed, and what they give way to."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from learning_samples import linear_agent
+
+from finetune.rollout import SubgoalPolicy
+from pretrain.config import SubgoalConfig
+from pretrain.proposers.proposer import SubgoalProposer
+
+SETTINGS = SubgoalConfig(candidates=1, every_steps=5, reached_m=0.02, final_m=0.05)
+FAR = np.full((2, 2), 5.0, np.float32)
+
+
+class Counting(SubgoalProposer):
+    """Proposes (1, 0), then (2, 0) and so on, whatever it is asked."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.asked = 0
+
+    def propose(self, observation, goal, count):
+        self.asked += 1
+        candidates = torch.tensor([float(self.asked), 0.0]).expand(len(goal), count, 2)
+        return candidates.clone(), torch.zeros(len(goal), count)
+
+    def loss(self, observation, goal, subgoal):
+        raise NotImplementedError
+
+
+def counting_policy(worlds: int = 2, **changes: object) -> SubgoalPolicy:
+    agent = linear_agent(subgoals=replace(SETTINGS, **changes))  # type: ignore[arg-type]
+    agent.proposer = Counting()
+    return SubgoalPolicy(agent, worlds)
+
+
+def step(policy: SubgoalPolicy, achieved=None, desired=FAR, explore: bool = False) -> np.ndarray:
+    achieved = np.zeros((2, 2), np.float32) if achieved is None else achieved
+    return policy.act(achieved, achieved, desired, explore=explore)
+
+
+def test_a_subgoal_lasts_for_t_steps():
+    policy = counting_policy()
+    seen = []
+    for _ in range(12):
+        step(policy)
+        seen.append(policy.subgoal[0, 0])
+    assert seen == [1] * 5 + [2] * 5 + [3] * 2
+
+
+def test_a_subgoal_that_is_reached_gives_way_at_once_and_only_in_its_world():
+    policy = counting_policy()
+    for _ in range(3):
+        step(policy)
+    there = np.array([[1.015, 0.0], [0.97, 0.0]], np.float32)
+    step(policy, there)
+    assert policy.subgoal[:, 0].tolist() == [2, 1]
+    for _ in range(2):
+        step(policy)
+    assert policy.subgoal[:, 0].tolist() == [2, 3]
+
+
+def test_a_reset_renews_the_subgoals_of_the_worlds_it_names():
+    policy = counting_policy()
+    step(policy)
+    policy.reset(np.array([1]))
+    step(policy)
+    assert policy.subgoal[:, 0].tolist() == [1, 2]
+
+
+def test_a_subgoal_near_the_final_goal_gives_way_to_it():
+    policy = counting_policy()
+    desired = np.array([[1.04, 0.0], [1.06, 0.0]], np.float32)
+    step(policy, desired=desired)
+    np.testing.assert_array_equal(policy.subgoal[0], desired[0])
+    np.testing.assert_array_equal(policy.subgoal[1], [1.0, 0.0])
+
+
+def test_without_subgoals_the_final_goal_is_followed_alone():
+    policy = counting_policy(source="none")
+    desired = np.array([[3.0, 1.0], [4.0, 2.0]], np.float32)
+    for _ in range(7):
+        step(policy, desired=desired)
+        np.testing.assert_array_equal(policy.subgoal, desired)
+    assert policy._agent.proposer.asked == 0
+
+
+def test_random_subgoals_are_goals_that_the_dataset_achieved():
+    policy = counting_policy(worlds=50, source="random", candidates=4)
+    nowhere, far = np.zeros((50, 2), np.float32), np.full((50, 2), 9.0, np.float32)
+    policy.act(nowhere, nowhere, far, explore=False)
+    bank = policy._agent.bank.numpy()
+    assert (policy.subgoal[:, None] == bank).all(-1).any(1).all()
+    assert len(np.unique(policy.subgoal, axis=0)) > 40
+    assert policy._agent.proposer.asked == 0
+
+
+def test_the_candidates_asked_for_are_k():
+    policy = counting_policy(candidates=7)
+    seen = []
+    propose = policy._agent.proposer.propose
+    policy._agent.proposer.propose = lambda *args: seen.append(args[2]) or propose(*args)
+    step(policy)
+    assert seen == [7]
+
+
+@pytest.mark.parametrize("explore", [True, False])
+def test_actions_are_float32_within_bounds_and_head_for_the_subgoal(explore):
+    policy = counting_policy()
+    # The linear actor's mean is the subgoal's x.
+    policy._agent.sac.actor.body[-1].weight.data[0, 2] = 1.0
+    policy._agent.sac.actor.body[-1].bias.data[1] = -5.0
+    action = step(policy, explore=explore)
+    assert action.shape == (2, 1) and action.dtype == np.float32
+    np.testing.assert_allclose(action, np.tanh(1.0), atol=0.05 if explore else 1e-6)
+    assert (np.abs(action) <= 1).all()
