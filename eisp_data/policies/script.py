@@ -22,6 +22,7 @@ from eisp_data.tasks.base import ACTION_SCALE_M, Task
 OPEN, CLOSED = 1.0, -1.0
 _BLUNDER_M = 0.06
 _LEAST_EFFORT = 0.25
+_RISE_M = 0.04
 
 
 @dataclass(frozen=True)
@@ -54,8 +55,10 @@ class Noise:
     script then does about it is what a policy has to know in order to recover."""
     slowest: float = 1.0
     """Each episode moves at a share of full speed drawn from [slowest, 1]."""
-    slip: float = 0.0
-    """Probability, per step, that the fingers do the opposite for a few steps."""
+    stumble: float = 0.0
+    """Probability, per step, that the gripper goes astray for two to six steps: in some direction
+    and, half of the time, with its fingers the other way. It may end up on top of a block, and
+    the script has to find its way out of there."""
     partial: bool = False
     """Whether the script does a random part of the task only (a random level of the goal)."""
     whole_share: float = 0.05
@@ -134,9 +137,11 @@ class _Actor:
         self.view, self.aim = view, aim
         self.speed = aim.rng.uniform(aim.noise.slowest, 1.0)
         self.frames = script(view, aim)
-        self.frame: Keyframe | None = None
+        self.frame = Keyframe(view.gripper, OPEN)
         self.finished = False
-        self._steps = self._held = self._slipping = 0
+        self._ways_back: list[Keyframe] = []
+        self._stumble: _Stumble | None = None
+        self._steps = self._held = 0
         self._next()
 
     def _next(self) -> None:
@@ -150,34 +155,71 @@ class _Actor:
     def act(self) -> np.ndarray:
         """Return the action (4,) towards the current keyframe."""
         gripper = self.view.gripper
-        if self.frame is None:
-            self.frame = Keyframe(gripper, OPEN)
-        if not self.finished:
-            there = np.linalg.norm(self.frame.position - gripper) <= self._tolerance_m()
-            if (there and self._held >= self.frame.hold_steps) or (
-                self._steps >= self.frame.most_steps
-            ):
+        if self._astray(gripper):
+            assert self._stumble is not None
+            fingers = self.frame.fingers * self._stumble.fingers
+            return self._noisy(self._stumble.direction, fingers)
+        frame = self._ways_back[0] if self._ways_back else self.frame
+        if self._ways_back or not self.finished:
+            tolerance = frame.tolerance_m
+            tolerance += _LEAST_EFFORT * self.aim.noise.action_std * ACTION_SCALE_M
+            there = np.linalg.norm(frame.position - gripper) <= tolerance
+            over = (there and self._held >= frame.hold_steps) or self._steps >= frame.most_steps
+            if over and self._ways_back:
+                self._ways_back.pop(0)
+                self._steps = self._held = 0
+            elif over:
                 self._next()
+                frame = self.frame
             self._held += bool(there)
             self._steps += 1
-        return self._noisy((self.frame.position - gripper) / ACTION_SCALE_M, self.frame.fingers)
+        return self._noisy((frame.position - gripper) / ACTION_SCALE_M, frame.fingers)
 
-    def _tolerance_m(self) -> float:
-        assert self.frame is not None
-        return self.frame.tolerance_m + _LEAST_EFFORT * self.aim.noise.action_std * ACTION_SCALE_M
+    def _astray(self, gripper: np.ndarray) -> bool:
+        """Begin, go on with or end a stumble; after one, rise and go back over where it began."""
+        noise, rng = self.aim.noise, self.aim.rng
+        if self._stumble is None:
+            if not noise.stumble or self._ways_back or rng.random() >= noise.stumble:
+                return False
+            self._stumble = _Stumble(
+                start=gripper,
+                direction=rng.uniform(-1.0, 1.0, 3),
+                fingers=float(rng.choice([-1.0, 1.0])),
+                steps=int(rng.integers(2, 7)),
+            )
+        self._stumble.steps -= 1
+        if self._stumble.steps >= 0:
+            return True
+        start, self._stumble = self._stumble.start, None
+        height = max(start[2], gripper[2]) + _RISE_M
+        self._ways_back = [
+            Keyframe(np.append(place[:2], height), self.frame.fingers, tolerance_m=0.02)
+            for place in (gripper, start)
+        ]
+        self._steps = self._held = 0
+        return False
 
     def _noisy(self, displacement: np.ndarray, fingers: float) -> np.ndarray:
         noise, rng = self.aim.noise, self.aim.rng
-        if noise.slip and self._slipping == 0 and rng.random() < noise.slip:
-            self._slipping = int(rng.integers(2, 6))
-        if self._slipping:
-            self._slipping -= 1
-            fingers = -fingers
         action = np.append(np.clip(displacement, -self.speed, self.speed), fingers)
         if noise.action_std:
             effort = max(_LEAST_EFFORT, float(np.abs(action[:3]).max()))
             action += rng.normal(0.0, noise.action_std * effort, 4)
         return np.clip(action, -1.0, 1.0)
+
+
+@dataclass
+class _Stumble:
+    """The gripper gone astray."""
+
+    start: np.ndarray
+    """(3,) m, where it was."""
+    direction: np.ndarray
+    """(3,) displacement of the action."""
+    fingers: float
+    """-1 if the fingers do the opposite of what the script wants, else 1."""
+    steps: int
+    """Still to go."""
 
 
 class ScriptedPolicy:
