@@ -52,5 +52,5 @@ class Line(gymnasium.Env):
         }
 
 
-gymnasium.register("Line-v0", Line, max_episode_steps=STEPS)
-gymnasium.register("ShortLine-v0", Line, max_episode_steps=STEPS, kwargs={"over_after": 4})
+gymnasium.register("PushedLine-v0", Line, max_episode_steps=STEPS)
+gymnasium.register("ShortPushedLine-v0", Line, max_episode_steps=STEPS, kwargs={"over_after": 4})

@@ -47,7 +47,7 @@ def test_a_mean_has_its_normal_interval():
 
 @pytest.mark.parametrize("batch", [1, 2, 5])
 def test_every_episode_counts_once_however_they_are_batched(batch):
-    worlds = GymWorlds("line_env:Line-v0", batch)
+    worlds = GymWorlds("line_env:PushedLine-v0", batch)
     result = evaluate(line_agent(), worlds, 5, 100)
     # Seeds 100 to 104: three even ones start at their goal and stay there.
     assert (result.episodes, result.seed) == (5, 100)
@@ -60,20 +60,20 @@ def test_every_episode_counts_once_however_they_are_batched(batch):
 
 
 def test_success_at_some_step_is_not_success_at_the_last():
-    result = evaluate(line_agent(push=3.0), GymWorlds("line_env:Line-v0", 2), 4, 100)
+    result = evaluate(line_agent(push=3.0), GymWorlds("line_env:PushedLine-v0", 2), 4, 100)
     assert result.success_any.mean == 0.5 and result.success_last.mean == 0.0
     assert -STEPS < result.return_.mean <= -STEPS * 0.9
 
 
 def test_a_foreign_environment_has_no_figures_of_ours():
-    result = evaluate(line_agent(), GymWorlds("line_env:Line-v0", 2), 2, 0)
+    result = evaluate(line_agent(), GymWorlds("line_env:PushedLine-v0", 2), 2, 0)
     assert result.relative_return is result.oracle_return is result.paper_return is None
     assert result.success_settled is None
-    assert oracle_return("line_env:Line-v0", 2, 0) is None
+    assert oracle_return("line_env:PushedLine-v0", 2, 0) is None
 
 
 def test_the_relative_return_is_one_for_the_oracle_and_zero_for_nothing():
-    worlds = GymWorlds("line_env:Line-v0", 4)
+    worlds = GymWorlds("line_env:PushedLine-v0", 4)
     result = evaluate(line_agent(), worlds, 4, 100, oracle=-5.0)
     assert result.relative_return.mean == pytest.approx(1.0)
     nothing = evaluate(line_agent(push=9.0), worlds, 1, 101, oracle=-5.0)
@@ -81,7 +81,7 @@ def test_the_relative_return_is_one_for_the_oracle_and_zero_for_nothing():
 
 
 def test_the_figures_are_plain_json():
-    result = evaluate(line_agent(), GymWorlds("line_env:Line-v0", 2), 2, 0)
+    result = evaluate(line_agent(), GymWorlds("line_env:PushedLine-v0", 2), 2, 0)
     plain = json.loads(json.dumps(result.to_plain(), allow_nan=False))
     assert plain["return"]["mean"] == result.return_.mean
     assert plain["success_last"]["low"] == result.success_last.low

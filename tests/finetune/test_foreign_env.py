@@ -43,7 +43,7 @@ def metrics_of(run: Path) -> list[dict[str, float]]:
     return [{k: v for k, v in line.items() if k != "wall_s"} for line in lines]
 
 
-@pytest.mark.parametrize("env_id", ["FetchPickAndPlace-v4", "line_env:Line-v0"])
+@pytest.mark.parametrize("env_id", ["FetchPickAndPlace-v4", "line_env:PushedLine-v0"])
 def test_an_environment_is_learned_from_nothing(tmp_path, env_id):
     summary = learn(env_id, tmp_path / "run")
     assert 0 <= summary["best_success"] <= 1
@@ -56,7 +56,7 @@ def test_an_environment_is_learned_from_nothing(tmp_path, env_id):
     assert evaluate(agent, GymWorlds(env_id, 2), 2, 0).episodes == 2
 
 
-@pytest.mark.parametrize("env_id", ["line_env:Line-v0", "line_env:ShortLine-v0"])
+@pytest.mark.parametrize("env_id", ["line_env:PushedLine-v0", "line_env:ShortPushedLine-v0"])
 def test_a_run_in_a_foreign_environment_resumes_as_well(tmp_path, env_id):
     longer = replace(SMALL, rounds=2)
     learn(env_id, tmp_path / "whole", online=longer)
@@ -66,7 +66,7 @@ def test_a_run_in_a_foreign_environment_resumes_as_well(tmp_path, env_id):
 
 
 def test_the_first_episodes_are_real_and_end_where_the_environment_ends_them():
-    agent, data = finetune.run._from_nothing("line_env:ShortLine-v0", 0)
+    agent, data = finetune.run._from_nothing("line_env:ShortPushedLine-v0", 0)
     assert np.diff(data.episode_start).tolist() == [5, 5, 5]
     for start, stop in zip(data.episode_start, data.episode_start[1:], strict=False):
         moved = np.diff(data.achieved_goal[start:stop, 0])

@@ -219,7 +219,7 @@ def rollouts(env_id: str, count: int = 3, source: str = "none") -> Rollouts:
 
 
 def test_collected_rows_are_what_happened():
-    observation, achieved, action, starts = rollouts("Line-v0").collect(5)
+    observation, achieved, action, starts = rollouts("PushedLine-v0").collect(5)
     assert starts.tolist() == [0, 6, 12, 18]
     np.testing.assert_array_equal(observation, achieved)
     for first, stop in zip(starts, starts[1:], strict=False):
@@ -230,7 +230,7 @@ def test_collected_rows_are_what_happened():
 
 
 def test_a_world_that_ends_early_leaves_no_rows_after_its_end():
-    started = rollouts("ShortLine-v0")
+    started = rollouts("ShortPushedLine-v0")
     _, achieved, action, starts = started.collect(10)
     assert np.diff(starts).tolist() == [5, 5, 5]
     for first, stop in zip(starts, starts[1:], strict=False):
@@ -240,7 +240,7 @@ def test_a_world_that_ends_early_leaves_no_rows_after_its_end():
 
 
 def test_worlds_start_anew_when_they_are_over_or_have_kept_a_success_for_a_round():
-    started = rollouts("Line-v0")
+    started = rollouts("PushedLine-v0")
     # The noise stays within 5 cm of where each began: 102 begins at its goal, 101 and 103 do not.
     started.policy._agent.sac.actor.body[-1].bias.data[1] = -5.0
     started.collect(2)
@@ -254,7 +254,10 @@ def test_worlds_start_anew_when_they_are_over_or_have_kept_a_success_for_a_round
 
 
 def test_rollouts_go_on_from_their_state():
-    first, again = rollouts("Line-v0", source="random"), rollouts("Line-v0", source="random")
+    first, again = (
+        rollouts("PushedLine-v0", source="random"),
+        rollouts("PushedLine-v0", source="random"),
+    )
     first.collect(3)
     state = {name: value.copy() for name, value in first.state().items()}
     torch.manual_seed(7)
