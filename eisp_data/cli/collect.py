@@ -20,7 +20,9 @@ _BATCH = 50
 _SEEDS_APART = 1_000_000
 _LAST_SEED = 498
 CONFIG_FILE = "meta/collect.yaml"
-"""In the dataset; give it back with ``--config``."""
+"""In the dataset; give it back with ``--config`` and another ``--output-dir``."""
+_NOT_OF_THE_DATA = ("output_dir", "resume")
+"""Not saved: a push would publish the path, and what was resumed here starts anew elsewhere."""
 
 
 @dataclass(frozen=True)
@@ -67,14 +69,15 @@ def collect(config: CollectConfig) -> None:
     _check(config)
     from tqdm import tqdm
 
-    from eisp_data.config import save_yaml
+    from eisp_data.config import save_yaml, to_plain
     from eisp_data.storage.lerobot import DatasetWriter
 
     source = _EnvSource(config) if config.env.id else _TaskSource(config)
     recipe = {"policy": source.policy, "seed": config.seed, **source.recipe}
     try:
         writer = DatasetWriter(config.output_dir, source.spec, recipe, resume=config.resume)
-        save_yaml(config, config.output_dir / CONFIG_FILE)
+        settings = {k: v for k, v in to_plain(config).items() if k not in _NOT_OF_THE_DATA}
+        save_yaml(settings, config.output_dir / CONFIG_FILE)
     except OSError as error:
         raise ConfigError(f"cannot write to {config.output_dir}: {error.strerror}") from None
     with writer:

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from eisp_data.cli.collect import CollectConfig, EnvConfig, collect, episode_seeds
-from eisp_data.config import load_yaml
+from eisp_data.cli.collect import CONFIG_FILE, CollectConfig, EnvConfig, collect, episode_seeds
+from eisp_data.cli.parse import parse
 from eisp_data.errors import ConfigError
 from eisp_data.storage.lerobot import read_episodes, read_recipe, read_spec
 
@@ -45,11 +45,26 @@ def test_a_resumed_dataset_is_the_one_that_was_never_interrupted(stack, tmp_path
     collect(replace(stack, output_dir=tmp_path / "data", episodes=1))
     collect(replace(stack, output_dir=tmp_path / "data", resume=True))
     assert_same(stack.output_dir, tmp_path / "data")
+    assert not configured_again(tmp_path / "data", tmp_path / "other").resume
     assert "4 episodes" in capsys.readouterr().out
 
 
-def test_the_configuration_is_in_the_dataset(stack):
-    assert load_yaml(CollectConfig, stack.output_dir / "meta/collect.yaml") == stack
+def configured_again(dataset, to):
+    words = ["--config", str(dataset / CONFIG_FILE), "--output-dir", str(to)]
+    return parse(CollectConfig, words, config_file=True)
+
+
+def test_the_configuration_is_in_the_dataset_and_makes_it_anew_elsewhere(stack, tmp_path):
+    again = configured_again(stack.output_dir, tmp_path / "data")
+    assert again == replace(stack, output_dir=tmp_path / "data")
+
+
+def test_what_is_saved_says_nothing_of_this_machine(stack):
+    """A push would publish it."""
+    saved = (stack.output_dir / CONFIG_FILE).read_text()
+    assert "output_dir" not in saved and str(stack.output_dir.parent) not in saved
+    with pytest.raises(ConfigError, match="missing --output-dir"):
+        parse(CollectConfig, ["--config", str(stack.output_dir / CONFIG_FILE)], config_file=True)
 
 
 def test_the_recipe_says_who_acted_and_how_noisily(stack):
