@@ -11,7 +11,7 @@ ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 # What the demo runs; a stage's own defaults are right for a longer run.
 DEMO := runs/demo
 DEMO_TASK ?= stack
-DEMO_EPISODES ?= 1000
+DEMO_EPISODES ?= 1500
 DEMO_PRETRAIN ?=
 DEMO_FINETUNE ?=
 DEMO_EVALUATION ?= --episodes 100 --seed 1000

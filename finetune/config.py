@@ -21,8 +21,8 @@ class OnlineConfig:
     batch_size: int = 256
     offline_share: float = 0.5
     """Share of each batch that comes from the dataset."""
-    lr: float = 3e-4
-    """Of SAC."""
+    lr: float = 1.5e-4
+    """Of SAC; near the one that pretraining ends with, or what it settled is stirred up again."""
     cloning: float = 20.0
     """Weight of cloning the actions that led to the goal."""
     generator_every: int = 4

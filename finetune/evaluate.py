@@ -138,7 +138,7 @@ def _batch(
     worlds.reset(range(seed, seed + worlds.count))
     policy = SubgoalPolicy(agent, worlds.count, device)
     returns = np.zeros(worlds.count)
-    some = worlds.success.copy()
+    some = worlds.success
     for _ in range(worlds.episode_steps):
         action = policy.act(
             worlds.observation, worlds.achieved_goal, worlds.desired_goal, explore=False

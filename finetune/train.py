@@ -75,7 +75,7 @@ class Rollouts:
         columns = [np.stack(column, 1)[lived] for column in zip(*rows, last, strict=True)]
         # A success that lasted for a round is learned; one that is new has still to be kept.
         over = worlds.truncated | worlds.done | (self.solved & worlds.success)
-        self.solved = worlds.success.copy()
+        self.solved = worlds.success
         self.start(np.flatnonzero(over))
         return *columns, np.concatenate([[0], np.cumsum(lengths)])
 

@@ -20,6 +20,7 @@ class SacConfig:
     layers: tuple[int, ...] = (256, 256)
     """Hidden sizes of actor and critics (Table I: pi)."""
     lr: float = 3e-4
+    """At the start of pretraining; it falls linearly to a tenth."""
     alpha: float = 0.01
     """Temperature, fixed (Table I: alpha)."""
     gamma: float = 0.99

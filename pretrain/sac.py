@@ -177,6 +177,11 @@ class SacOptimizer:
         self.actor = torch.optim.Adam(sac.actor.parameters(), lr=lr, fused=True)
         self.critic = torch.optim.Adam(sac.critic.parameters(), lr=lr, fused=True)
 
+    def set_lr(self, lr: float) -> None:
+        """Change the learning rate of actor and critics."""
+        for optimizer in (self.actor, self.critic):
+            optimizer.param_groups[0]["lr"] = lr
+
     def update(self, batch: Batch, cloning: float) -> Info:
         """Update critics, actor and target on one batch."""
         loss, critic_info = self.sac.critic_loss(batch)

@@ -54,11 +54,12 @@ def pretrain(config: PretrainConfig) -> Path:
     info: dict[str, Tensor] = {}
     steps = range(done + 1, config.updates + 1)
     for update in tqdm(steps, "pretraining", config.updates, initial=done, mininterval=1.0):
+        remaining = 1.0 - update / config.updates
+        sac.set_lr(config.agent.sac.lr * max(0.1, remaining))
+        generator.param_groups[0]["lr"] = config.generator_lr * max(0.01, remaining)
         batch = train.transitions(config.batch_size, config.agent.mix, rng)
         info |= sac.update(batch.to(device), config.agent.sac.cloning)
         if update % config.generator_every == 0:
-            remaining = max(0.01, 1.0 - update / config.updates)
-            generator.param_groups[0]["lr"] = config.generator_lr * remaining
             info |= update_generator(agent, generator, train, config.generator_batch_size, rng)
         if update % config.validate_every == 0 or update == config.updates:
             held = validate(agent, held_out, device)
