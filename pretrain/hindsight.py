@@ -159,7 +159,7 @@ def find_waypoints(
         episode_start: (E + 1,) first row of each episode.
         parts: the paper's n; None for waypoints at rest.
     """
-    rows, beyond = [], []
+    rows, beyond = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     following = np.full(len(achieved_goal), -1, np.int64)
     count = 0
     for start, stop in zip(episode_start[:-1], episode_start[1:], strict=True):

@@ -99,14 +99,16 @@ def test_learning_moves_actor_critic_and_generator(finished, pretrained):
     assert torch.equal(before["bank"], after["bank"])
 
 
+@pytest.mark.parametrize("checkpointed", [True, False])
 def test_a_run_that_is_interrupted_and_resumed_ends_like_one_that_is_not(
-    finished, pretrained, tmp_path, monkeypatch
+    finished, pretrained, tmp_path, monkeypatch, checkpointed
 ):
     config = tiny_finetuning(pretrained, tmp_path / "run")
     save = checkpoint.save
 
     def save_and_die(run: Path, at: int, *args: object) -> None:
-        save(run, at, *args)  # type: ignore[arg-type]
+        if at == 0 or checkpointed:
+            save(run, at, *args)  # type: ignore[arg-type]
         if at == 1:
             raise Killed
 
