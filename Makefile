@@ -12,8 +12,8 @@ ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 DEMO := runs/demo
 DEMO_TASK ?= stack
 DEMO_EPISODES ?= 1500
-DEMO_PRETRAIN ?=
-DEMO_FINETUNE ?=
+DEMO_PRETRAIN ?= --updates 18000
+DEMO_FINETUNE ?= --online.rounds 8 --online.evaluate-every 4
 DEMO_EVALUATION ?= --episodes 100 --seed 1000
 
 .PHONY: demo test lint bench install constraints

@@ -128,7 +128,7 @@ class PretrainConfig:
     output_dir: Path
     """Where the run goes."""
     agent: AgentConfig
-    updates: int = 15_000
+    updates: int = 20_000
     """Updates of SAC."""
     batch_size: int = 256
     generator_every: int = 4
