@@ -74,8 +74,9 @@ class FinetuneConfig:
     online: OnlineConfig = field(default_factory=OnlineConfig)
     seed: int = 0
     device: DeviceName = "auto"
-    threads: int | None = None
-    """Threads of the networks on a processor; all cores if left out."""
+    threads: int = 1
+    """Threads of the networks on a processor. For networks this small one is the fastest, and the
+    only one that other work on the machine does not slow down many times over."""
     resume: bool = False
     """Go on from the newest checkpoint in the output folder."""
 
@@ -94,5 +95,6 @@ class EvaluateConfig:
     video: Path | None = None
     """Film the first episode, with subgoals and goal drawn in, into this MP4 file."""
     device: DeviceName = "auto"
-    threads: int | None = None
-    """Threads of the networks on a processor; all cores if left out."""
+    threads: int = 1
+    """Threads of the networks on a processor. For networks this small one is the fastest, and the
+    only one that other work on the machine does not slow down many times over."""

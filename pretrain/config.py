@@ -142,7 +142,8 @@ class PretrainConfig:
     """Updates between validations, each followed by a checkpoint."""
     seed: int = 0
     device: DeviceName = "auto"
-    threads: int | None = None
-    """Threads of the networks on a processor; all cores if left out."""
+    threads: int = 1
+    """Threads of the networks on a processor. For networks this small one is the fastest, and the
+    only one that other work on the machine does not slow down many times over."""
     resume: bool = False
     """Go on from the newest checkpoint in the output folder."""

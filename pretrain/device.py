@@ -9,19 +9,19 @@ from eisp_data.sim.physics import default_threads
 from pretrain.config import DeviceName
 
 
-def set_up(device: DeviceName, threads: int | None) -> str:
+def set_up(device: DeviceName, threads: int) -> str:
     """Choose the device and the threads for the networks; return what torch calls the device.
 
     Products of fp32 matrices may take bf16 passes where the processor has them: twice as fast.
 
     Args:
         device: ``auto`` takes CUDA where there is one.
-        threads: for the processor; None takes all cores that this process may use.
+        threads: for the processor.
     """
     if device == "cuda" and not torch.cuda.is_available():
         raise ConfigError("--device cuda: this torch sees no CUDA device; choose auto or cpu")
     chosen = "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
-    torch.set_num_threads(threads or default_threads())
+    torch.set_num_threads(threads)
     torch.set_float32_matmul_precision("medium")
     return chosen
 
@@ -29,5 +29,5 @@ def set_up(device: DeviceName, threads: int | None) -> str:
 def describe(device: str) -> str:
     """Return one line that says what is used."""
     if device == "cuda":
-        return f"networks on {torch.cuda.get_device_name()}, physics on {default_threads()} threads"
-    return f"networks on {torch.get_num_threads()} threads, physics on {default_threads()} threads"
+        return f"networks on {torch.cuda.get_device_name()}, physics on {default_threads()}"
+    return f"networks on {torch.get_num_threads()} thread(s), physics on {default_threads()}"

@@ -48,9 +48,10 @@ DEMONSTRATOR: dict[str, Noise] = {
         aim_std_m=0.004,
         blunder=0.1,
         slowest=0.6,
-        stumble=0.006,
+        # A stumble while the drawer is being closed may slam it: the whole task by accident.
+        stumble=0.004,
         partial=True,
-        whole_share=0.06,
+        whole_share=0.04,
         least_s=6.0,
     ),
 }
