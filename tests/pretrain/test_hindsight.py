@@ -141,6 +141,12 @@ def test_every_goal_that_is_no_detour_is_drawn(found, parts):
         assert set(goal.tolist()) == allowed
 
 
+@pytest.mark.parametrize("parts", [None, 3])
+def test_no_episodes_have_no_waypoints(parts):
+    waypoints = find_waypoints(np.empty((0, 9), np.float32), np.zeros(1, np.int64), parts)
+    assert len(waypoints.row) == len(waypoints.following) == len(waypoints.beyond) == 0
+
+
 def assert_equal(ours: Waypoints, theirs: Waypoints) -> None:
     np.testing.assert_array_equal(ours.row, theirs.row)
     np.testing.assert_array_equal(ours.following, theirs.following)
