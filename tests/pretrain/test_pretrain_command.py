@@ -33,9 +33,8 @@ def test_a_policy_is_made_and_its_place_said(stack_dataset, tmp_path, monkeypatc
     root = ["--dataset.root", stack_dataset, "--output-dir", tmp_path / "run"]
     run(monkeypatch, *root, *SMALL)
     said = capsys.readouterr().out
-    assert "networks on 1 threads" in said
+    assert "networks on 1 thread" in said
     assert f"policy: {tmp_path / 'run/checkpoints/last'}" in said
-    assert "already" not in said
     assert "is not empty; add --resume" in mistake(monkeypatch, capsys, *root, *SMALL)
     # A resumed run keeps its settings, and takes others from the command line.
     run(monkeypatch, "--output-dir", tmp_path / "run", "--resume", "--updates", "3")
