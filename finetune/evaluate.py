@@ -175,7 +175,10 @@ def share_interval(hits: np.ndarray) -> Estimate:
     centre = (share + _Z**2 / (2 * count)) / (1 + _Z**2 / count)
     spread = share * (1 - share) / count + _Z**2 / (4 * count**2)
     half = _Z * float(np.sqrt(spread)) / (1 + _Z**2 / count)
-    return Estimate(share, max(0.0, centre - half), min(1.0, centre + half))
+    # At the ends the bounds are exact; rounding would leave a 3e-18 there.
+    low = centre - half if share > 0.0 else 0.0
+    high = centre + half if share < 1.0 else 1.0
+    return Estimate(share, low, high)
 
 
 def mean_interval(values: np.ndarray) -> Estimate:
