@@ -58,11 +58,3 @@ class Physics:
             initial_warmstart=None,
         )
         return path[:, -1].copy()
-
-    def qpos(self, state: np.ndarray) -> np.ndarray:
-        """Return the view (..., nq) of the joint positions in (..., P) states."""
-        return state[..., 1 : 1 + self.model.nq]
-
-    def qvel(self, state: np.ndarray) -> np.ndarray:
-        """Return the view (..., nv) of the joint velocities in (..., P) states."""
-        return state[..., 1 + self.model.nq : 1 + self.model.nq + self.model.nv]
