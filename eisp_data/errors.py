@@ -11,3 +11,7 @@ class DataError(EispError):
 
 class ConfigError(EispError):
     """A flag, a name or a combination of settings that cannot be used."""
+
+
+class RobotError(EispError):
+    """A robot or a camera that does not answer, refuses, or may not do what it was asked."""
