@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from functools import cache
 
-import mujoco
 import numpy as np
 
-from eisp_data.sim.scene import BLOCK_SIZE_M, table_model
+from eisp_data.sim.scene import BLOCK_SIZE_M, table_scene
 
 TRAVEL_M = 0.15
 """Way of the drawer from closed to open."""
@@ -91,8 +90,8 @@ def _cabinet() -> str:
 
 
 @cache
-def drawer_model() -> mujoco.MjModel:
-    """Compile the table with the drawer and one block; the drawer's slide is 0 when closed."""
+def drawer_scene() -> str:
+    """Return the table with the drawer and one block; the drawer's slide is 0 when closed."""
     fixtures = f"""
     {_cabinet()}
     <body name="drawer" gravcomp="1">
@@ -101,4 +100,4 @@ def drawer_model() -> mujoco.MjModel:
              frictionloss="1.5" solreflimit="0.008 1"/>
       {_drawer()}
     </body>"""
-    return table_model(1, fixtures)
+    return table_scene(1, fixtures)

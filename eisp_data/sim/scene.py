@@ -55,6 +55,7 @@ _SCENE = """
     <camera name="front" pos="-0.26 -0.36 0.55" fovy="36"
             xyaxes="0.5177 -0.8556 0 0.5027 0.3042 0.8092"/>
     <camera name="top" pos="0.33 0 0.85" xyaxes="0 -1 0 1 0 0" fovy="32"/>
+    <camera name="shoulder" pos="-0.2 0 0.75" fovy="29" xyaxes="0 -1 0 0.8137 0 0.5812"/>
     <geom name="table" type="box" pos="0.35 0 -0.1" size="0.30 0.36 0.1" material="table"/>
     <body name="gripper" gravcomp="1">
       <joint name="gripper_x" type="slide" axis="1 0 0" armature="0.2"/>
@@ -115,8 +116,8 @@ def _block(index: int) -> str:
 
 
 @cache
-def table_model(blocks: int, fixtures: str = "") -> mujoco.MjModel:
-    """Compile the scene with some blocks on the table.
+def table_scene(blocks: int, fixtures: str = "") -> str:
+    """Return the MJCF of the scene with some blocks on the table.
 
     Args:
         blocks: how many blocks, at most four.
@@ -125,7 +126,12 @@ def table_model(blocks: int, fixtures: str = "") -> mujoco.MjModel:
     """
     objects = fixtures + "".join(_block(index) for index in range(blocks))
     sliding = "".join(_SLIDING.format(index=index) for index in range(blocks))
-    xml = _SCENE.format(
+    return _SCENE.format(
         timestep=TIMESTEP_S, travel=FINGER_TRAVEL_M, objects=objects, sliding=sliding
     )
-    return mujoco.MjModel.from_xml_string(xml)
+
+
+@cache
+def compile_scene(scene: str) -> mujoco.MjModel:
+    """Compile MJCF; the same text is the same model."""
+    return mujoco.MjModel.from_xml_string(scene)

@@ -21,6 +21,7 @@ from eisp_data.sim.scene import (
     TIMESTEP_S,
     WORKSPACE_HIGH_M,
     WORKSPACE_LOW_M,
+    compile_scene,
 )
 from eisp_data.tasks.paper import PaperSettings
 
@@ -89,8 +90,13 @@ class Task(ABC):
 
     @property
     @abstractmethod
+    def scene(self) -> str:
+        """What stands on the table, as MJCF."""
+
+    @property
     def model(self) -> mujoco.MjModel:
         """The compiled scene."""
+        return compile_scene(self.scene)
 
     @abstractmethod
     def reset(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import mujoco
 import numpy as np
 
-from eisp_data.sim.drawer import HANDLE_CLOSED_M, drawer_model
+from eisp_data.sim.drawer import HANDLE_CLOSED_M, drawer_scene
 from eisp_data.tasks.base import AT_REST_M_S, GRIPPER_DIM, OBJECT_DIM, ObjectSlot, Task
 
 _DRAWER = 5
@@ -24,9 +23,9 @@ class DrawerTask(Task):
     fixtures = 1
 
     @property
-    def model(self) -> mujoco.MjModel:
+    def scene(self) -> str:
         """The table with the drawer and one block."""
-        return drawer_model()
+        return drawer_scene()
 
     @property
     def objects(self) -> tuple[ObjectSlot, ...]:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import mujoco
 import numpy as np
 
-from eisp_data.sim.scene import BLOCK_SIZE_M, table_model
+from eisp_data.sim.scene import BLOCK_SIZE_M, table_scene
 from eisp_data.tasks import paper
 from eisp_data.tasks.base import Task
 from eisp_data.tasks.placement import scatter
@@ -37,9 +36,9 @@ class Push4(Task):
     fingers_closed = True
 
     @property
-    def model(self) -> mujoco.MjModel:
+    def scene(self) -> str:
         """The table with four blocks."""
-        return table_model(self.blocks)
+        return table_scene(self.blocks)
 
     def reset(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Draw four block positions, four targets and the gripper's position above them."""
