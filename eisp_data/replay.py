@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,17 +10,13 @@ import numpy as np
 
 from eisp_data.episode import Episode
 from eisp_data.errors import ConfigError, DataError
-from eisp_data.sim.render import Renderer
+from eisp_data.sim.pixels import Pixels
 from eisp_data.sim.worlds import Worlds
 from eisp_data.storage.lerobot import DatasetWriter, read_episodes, read_recipe, read_spec
 from eisp_data.tasks.base import Task
 from eisp_data.tasks.registry import get_task
 
 _BATCH_BYTES = 200_000_000
-NO_SHADOW = 0
-SOFT_SHADOW = 512
-"""Edge of the shadow map in pixels. Software OpenGL draws 6 frames/s with the scene's own 4096,
-60 with 512 and 2,600 with none, so pictures for training (48 x 48) have none."""
 
 
 @dataclass(frozen=True)
@@ -84,18 +79,6 @@ def replay(root: Path, numbers: Sequence[int] = ()) -> Iterator[Deviation]:
         yield Deviation(number, float(one_step), float(apart.max()), int(apart.argmax()))
 
 
-@contextmanager
-def light(task: Task, shadow: int, samples: int) -> Iterator[None]:
-    """Draw with another shadow map and so many samples a pixel within the ``with``."""
-    quality = task.model.vis.quality
-    before = quality.shadowsize, quality.offsamples
-    quality.shadowsize, quality.offsamples = shadow, samples
-    try:
-        yield
-    finally:
-        quality.shadowsize, quality.offsamples = before
-
-
 def render(
     root: Path,
     to: Path,
@@ -121,15 +104,13 @@ def render(
     if old.extras:
         raise DataError(f"{root}: columns {sorted(old.extras)} of a recording cannot be carried")
     spec = replace(old, cameras={**old.cameras, **cameras})
-    with light(task, NO_SHADOW, samples=4):
-        renderers = {name: Renderer(task, name, w, h) for name, (h, w) in cameras.items()}
+    renderers = {name: Pixels(task, name, *size) for name, size in cameras.items()}
     count, batch, size = 0, list[Episode](), 0
     try:
         with DatasetWriter(to, spec, read_recipe(root)) as writer:
             for _, episode in chosen_episodes(root, (), images=bool(old.cameras)):
                 images = {
-                    name: np.stack([renderer.render(state) for state in episode.sim_state])
-                    for name, renderer in renderers.items()
+                    name: renderer.draw(episode.sim_state) for name, renderer in renderers.items()
                 }
                 batch.append(replace(episode, images={**episode.images, **images}))
                 size += sum(frames.nbytes for frames in images.values())

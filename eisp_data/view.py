@@ -11,7 +11,8 @@ from PIL import Image
 
 from eisp_data.episode import Episode
 from eisp_data.errors import ConfigError, DataError, EispError
-from eisp_data.replay import SOFT_SHADOW, chosen_episodes, light, task_of
+from eisp_data.replay import chosen_episodes, task_of
+from eisp_data.sim.pixels import SOFT_SHADOW, light
 from eisp_data.sim.render import Renderer
 from eisp_data.storage.lerobot import DatasetSpec, read_spec
 from eisp_data.storage.preview import preview_png as plain_preview_png

@@ -27,7 +27,7 @@ class Render:
     to: Path
     """Folder of the copy with images."""
     cameras: tuple[str, ...] = ("front",)
-    """Cameras of the scene: front, top."""
+    """Cameras of the scene: front, top, shoulder."""
     height: int = 48
     """Pixels, even."""
     width: int = 48

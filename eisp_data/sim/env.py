@@ -46,7 +46,7 @@ class TaskEnv(GoalEnv):
         Args:
             task: a name of the task registry.
             render_mode: ``rgb_array`` or None.
-            camera: from where ``render`` looks, ``front`` or ``top``.
+            camera: from where ``render`` looks, ``front``, ``top`` or ``shoulder``.
             width: of a frame, pixels.
             height: of a frame, pixels.
 

@@ -30,7 +30,7 @@ class Renderer:
 
         Args:
             task: whose worlds to draw.
-            camera: a camera of the scene, ``front`` or ``top``.
+            camera: a camera of the scene, ``front``, ``top`` or ``shoulder``.
             width: pixels.
             height: pixels.
 
