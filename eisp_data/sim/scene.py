@@ -56,7 +56,6 @@ _SCENE = """
             xyaxes="0.5177 -0.8556 0 0.5027 0.3042 0.8092"/>
     <camera name="top" pos="0.33 0 0.85" xyaxes="0 -1 0 1 0 0" fovy="32"/>
     <camera name="shoulder" pos="-0.2 0 0.75" fovy="29" xyaxes="0 -1 0 0.8137 0 0.5812"/>
-    <camera name="shoulder" pos="-0.2 0 0.75" fovy="29" xyaxes="0 -1 0 0.8137 0 0.5812"/>
     <geom name="table" type="box" pos="0.35 0 -0.1" size="0.30 0.36 0.1" material="table"/>
     <body name="gripper" gravcomp="1">
       <joint name="gripper_x" type="slide" axis="1 0 0" armature="0.2"/>
