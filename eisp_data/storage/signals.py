@@ -7,6 +7,7 @@ import numpy as np
 from eisp_data.storage.checks import Check
 from eisp_data.storage.reader import Block
 from eisp_data.storage.rows import as_table
+from eisp_data.storage.schema import REPEATED
 from eisp_data.storage.spec import DatasetSpec
 
 STUCK_STEPS = 25
@@ -27,6 +28,8 @@ class Collected:
         self.rows = 0
         self.extremes: dict[str, tuple[np.ndarray, np.ndarray]] = {}
         """Column to its (D,) minimum and maximum."""
+        self.repeated = {name: 0 for name in spec.extras if name.startswith(REPEATED)}
+        """Column of a recording's camera to how many rows repeat a frame."""
         self._moves: dict[str, list[np.ndarray]] = {"observation.state": [], "action": []}
         self._lengths: list[int] = []
         self._pairs: list[tuple[np.ndarray, np.ndarray]] = []
@@ -44,6 +47,8 @@ class Collected:
                 low = np.minimum(low, self.extremes[name][0])
                 high = np.maximum(high, self.extremes[name][1])
             self.extremes[name] = (low, high)
+            if name in self.repeated:
+                self.repeated[name] += int(table.sum())
         for offset, start in enumerate(block.starts[:-1]):
             rows = slice(int(start), int(block.starts[offset + 1]))
             for name, moves in self._moves.items():
@@ -70,6 +75,15 @@ class Collected:
         more = f" and {len(found) - 3} more" if len(found) > 3 else ""
         detail = ", ".join(found[:3]) + more or "none"
         return Check("stuck channels", True, detail, warning=bool(found))
+
+    def repeats(self) -> Check:
+        """Count the rows that repeat a camera's frame because the next one was lost."""
+        found = [
+            f"{name.removeprefix(REPEATED)} {count} of {self.rows} rows ({count / self.rows:.1%})"
+            for name, count in self.repeated.items()
+            if count
+        ]
+        return Check("repeated frames", True, ", ".join(found) or "none", warning=bool(found))
 
     def lag(self) -> Check:
         """Estimate how many steps after an action the robot's state shows it.

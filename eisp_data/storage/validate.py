@@ -95,6 +95,8 @@ def _check_rows(
         run("statistics", lambda: _statistics(root, collected))
         run("stuck channels", collected.stuck)
         run("action lag", collected.lag)
+        if collected.repeated:
+            run("repeated frames", collected.repeats)
         run("success", collected.success)
 
 

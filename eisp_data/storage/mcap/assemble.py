@@ -17,9 +17,17 @@ from eisp_data.storage.mcap.build import GOAL, STATE, build_episode, scale_actio
 from eisp_data.storage.mcap.collect import Clock, Source
 from eisp_data.storage.mcap.mapping import EXTRA
 from eisp_data.storage.mcap.reader import McapLog
-from eisp_data.storage.mcap.resample import NANOSECONDS, gaps, pick, resample, usual_gap_ns
+from eisp_data.storage.mcap.resample import (
+    NANOSECONDS,
+    gaps,
+    pick,
+    resample,
+    stands_in,
+    usual_gap_ns,
+)
 from eisp_data.storage.mcap.sources import Recording, fetch_images
 from eisp_data.storage.mcap.windows import Window, cut, dropped
+from eisp_data.storage.schema import REPEATED
 
 AGE = "age_s."
 """Columns with the age of each source; below 0 where the nearest sample came later."""
@@ -69,6 +77,8 @@ def extra_widths(recording: Recording) -> dict[str, int]:
         if source.stream.to.startswith(EXTRA):
             name = source.stream.to.removeprefix(EXTRA)
             widths[name] = widths.get(name, 0) + len(source.names)
+        elif source.stream.camera is not None:
+            widths[REPEATED + source.stream.camera] = 1
     return {**widths, "intervention": 1}
 
 
@@ -210,7 +220,9 @@ class Assembler:
         columns: dict[str, list[np.ndarray]] = {}
         images: dict[str, np.ndarray] = {}
         extras: dict[str, np.ndarray] = {}
-        lines: list[str] = []
+        gap_lines: list[str] = []
+        repeat_lines: list[str] = []
+        repeated = 0
         for source, age in zip(
             self.recording.sources, age_columns(self.recording.sources), strict=True
         ):
@@ -219,23 +231,34 @@ class Assembler:
             values, ages_s = resample(source.series, asked, source.rule, limit)
             ages_s += (ticks - asked) / NANOSECONDS
             extras[age] = ages_s[:-1, None].astype(np.float32)
-            if source.stream.camera is not None:
+            camera = source.stream.camera
+            if camera is not None:
                 chosen = pick(source.series, asked, source.rule)
-                images[source.stream.camera] = fetch_images(
-                    self.log, source, chosen, self.rate.clock
-                )
+                images[camera] = fetch_images(self.log, source, chosen, self.rate.clock)
+                again = stands_in(source.series, source.lost_before, asked, source.rule)[:-1]
+                extras[REPEATED + camera] = again[:, None].astype(np.float32)
+                repeat_lines += self._repeat_lines(source, number, again)
+                repeated += int(again.sum())
             else:
                 if source.stream.to == "action":
                     values = scale_action(source.stream, values)
                 columns.setdefault(source.stream.to, []).append(values)
-            lines += self._gap_lines(source, number, ticks, limit)
+            gap_lines += self._gap_lines(source, number, ticks, limit)
         joined = {to: np.concatenate(parts, axis=1) for to, parts in columns.items()}
         for to in [to for to in joined if to.startswith(EXTRA)]:
             extras[to.removeprefix(EXTRA)] = joined.pop(to)[:-1].astype(np.float32)
         extras["intervention"] = _during(window.interventions, ticks[:-1])
-        info = self._info(window, ticks, number, len(lines))
+        info = self._info(window, ticks, number, len(gap_lines), repeated)
         episode = build_episode(joined, images, info, self.rate.epsilon_m, ended)
-        return Made(episode, extras, lines)
+        return Made(episode, extras, gap_lines + repeat_lines)
+
+    def _repeat_lines(self, source: Source, number: int, again: np.ndarray) -> list[str]:
+        if not again.any():
+            return []
+        return [
+            f"{self.log.path.name}: episode {number}: {source.stream.name}: {int(again.sum())} of "
+            f"{len(again)} rows repeat a frame, for the next one was lost"
+        ]
 
     def _gap_lines(
         self, source: Source, number: int, ticks: np.ndarray, limit_ns: int
@@ -250,7 +273,7 @@ class Assembler:
         ]
 
     def _info(
-        self, window: Window, ticks: np.ndarray, number: int, gap_count: int
+        self, window: Window, ticks: np.ndarray, number: int, gap_count: int, repeated: int
     ) -> dict[str, Scalar]:
         return {
             **window.details,
@@ -263,6 +286,7 @@ class Assembler:
             "complete": window.complete,
             "interventions": len(window.interventions),
             "gaps": gap_count,
+            "repeated_frames": repeated,
             "goal": "recorded" if self._has_goal() else "last achieved",
         }
 

@@ -58,6 +58,7 @@ def chain(stream: StreamMap, found: list[Source]) -> Source:
         series=make_series(times, pose[:, columns], turns),
         names=tuple(last.names[column] for column in columns),
         log_times_ns=last.log_times_ns[kept],
+        lost_before=last.lost_before[kept],
         left_out=left_out,
     )
 

@@ -41,10 +41,23 @@ class Source:
     """Name of each column, e.g. ``elbow_joint.position``."""
     log_times_ns: np.ndarray
     """(N,) int64: when each sample was recorded, to find images again."""
+    lost_before: np.ndarray
+    """(N,) int64: messages that are missing just before each sample, by their sequence numbers."""
     image_size: tuple[int, int] | None = None
     """(height, width) of the images that go into the dataset."""
     left_out: dict[str, int] = field(default_factory=dict)
     """Reason to samples that were not used."""
+
+
+def lost_before(sequences: np.ndarray) -> np.ndarray:
+    """Return (N,) int64: how many messages are missing before each, by (N,) sequence numbers.
+
+    Zeros where the numbers do not count the messages of the channel: many recorders leave them at
+    0, and some count all channels together.
+    """
+    steps = np.diff(sequences, prepend=sequences[:1])
+    counts = len(steps) > 1 and np.median(steps[1:]) == 1
+    return np.maximum(steps - 1, 0) if counts else np.zeros_like(sequences)
 
 
 class Collector:
@@ -52,7 +65,7 @@ class Collector:
 
     def __init__(self, stream: StreamMap) -> None:
         self.stream = stream
-        self.times, self.logged = array("q"), array("q")
+        self.times, self.logged, self.sequences = array("q"), array("q"), array("q")
         self.values = array("d")
         self.names: tuple[str, ...] = ()
         self.quaternions: tuple[int, ...] = ()
@@ -95,14 +108,15 @@ class Collector:
         series = make_series(times, values, self.quaternions)
         usual = "interpolate" if self.kind is decode.Joints else "hold"
         rule = usual if stream.resampling == "default" else stream.resampling
-        at = make_series(times, logged[:, None]).values[:, 0]
+        lost = lost_before(np.frombuffer(self.sequences, np.int64))
+        at, lost = make_series(times, np.stack([logged, lost], axis=1)).values.T
         size = stream.size or self.size
         if size is not None and (size[0] % 2 or size[1] % 2):
             raise ConfigError(
                 f"{stream.topic}: video needs an even height and width, got {size[0]}x{size[1]}; "
                 "give a size in the mapping"
             )
-        return Source(stream, series, rule, self.names, at, size, self.left_out)
+        return Source(stream, series, rule, self.names, at, lost, size, self.left_out)
 
     def _append(self, entry: Entry, time_ns: int | None, clock: Clock) -> bool:
         at = time_of(entry, time_ns, clock)
@@ -111,6 +125,7 @@ class Collector:
             return False
         self.times.append(at)
         self.logged.append(entry.message.log_time_ns)
+        self.sequences.append(entry.message.sequence)
         return True
 
     def _leave_out(self, reason: str) -> None:

@@ -19,6 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 
 NANOSECONDS = 1_000_000_000
+_EARLY = 0.25
+"""Of an interval: how much less than two of them still means that a sample was lost."""
 
 
 @dataclass(frozen=True)
@@ -105,6 +107,36 @@ def gaps(series: Series, start_ns: int, end_ns: int, limit_ns: int) -> list[tupl
     edges = np.concatenate([[start_ns], inside, [end_ns]])
     long = np.flatnonzero(np.diff(edges) > limit_ns)
     return [(int(edges[i]), int(edges[i + 1])) for i in long]
+
+
+def stands_in(
+    series: Series, lost_before: np.ndarray, ticks_ns: np.ndarray, rule: str
+) -> np.ndarray:
+    """Return (K,) bool: rows whose sample stands in for one that was lost.
+
+    Samples are lost where their sequence numbers say so, and where a source that sends at a steady
+    rate has a gap; they are taken to lie evenly in it. Worked example: of frames every 40 ms that
+    of 80 ms is lost. Held rows at 79, 80, 119 and 120 ms give False, True, True, False.
+
+    Args:
+        series: the samples.
+        lost_before: (N,) int64, see ``collect.lost_before``.
+        ticks_ns: (K,) int64 times of the rows, rising, none before the first sample.
+        rule: hold or nearest.
+    """
+    usual = usual_gap_ns(series)
+    before = np.searchsorted(series.times_ns, ticks_ns, side="right") - 1
+    after = np.minimum(before + 1, len(series.times_ns) - 1)
+    since = ticks_ns - series.times_ns[before]
+    gap = series.times_ns[after] - series.times_ns[before]
+    lost = lost_before[after].astype(np.float64)
+    if usual:
+        lost = np.maximum(lost, np.floor(gap / usual + _EARLY) - 1)
+    passed = since * (lost + 1) / np.maximum(gap, 1)
+    place = np.round(passed) if rule == "nearest" else np.floor(passed)
+    # After the last sample there is no gap, but silence up to the last row.
+    silent = usual > 0 and ticks_ns[-1] - series.times_ns[-1] >= (2 - _EARLY) * usual
+    return np.where(before == after, silent & (since >= usual), (place >= 1) & (place <= lost))
 
 
 def usual_gap_ns(series: Series) -> int:

@@ -5,8 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 
+from eisp_data.episode import Episode
+from eisp_data.storage.lerobot import read_episodes
 from eisp_data.storage.mcap import messages
+from eisp_data.storage.mcap.convert import ConvertConfig, ConvertReport, convert
 from eisp_data.storage.mcap.writer import McapWriter, McapWriterConfig
 
 START_NS = 1_700_000_000_000_000_000
@@ -59,3 +63,22 @@ def _record_instant(writer: McapWriter, at: int, since: int, steps: int, camera:
     if since >= 0 and since % PERIOD_NS == 0 and since < end:
         k = since // PERIOD_NS
         writer.vector("/command", [k / 100, -k / 100], at, role="action")
+
+
+def run(source: Path, target: Path, **changes: object) -> tuple[list[Episode], ConvertReport]:
+    """Convert and return the episodes, without images."""
+    report = convert(ConvertConfig(inputs=(source,), to=target, **changes))  # type: ignore[arg-type]
+    return list(read_episodes(target)), report
+
+
+def rows(root: Path) -> dict[str, np.ndarray]:
+    """Return the columns of a dataset, all rows."""
+    tables = [pq.read_table(path) for path in sorted(root.glob("data/*/*.parquet"))]
+    names = [n for n in tables[0].column_names if not n.startswith("eisp.")]
+    return {n: np.concatenate([np.array(t[n].to_pylist()) for t in tables]) for n in names}
+
+
+def same(a: Episode, b: Episode) -> bool:
+    """Return whether two episodes are equal in every array and in what is said of them."""
+    arrays = ("observation", "achieved_goal", "desired_goal", "action", "reward", "success", "done")
+    return all(np.array_equal(getattr(a, n), getattr(b, n)) for n in arrays) and a.info == b.info

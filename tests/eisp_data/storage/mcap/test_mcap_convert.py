@@ -5,42 +5,29 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
-from mcap_samples import FAST, MS, PERIOD_NS, START_NS, joint_angle, record_session
+from mcap_samples import (
+    FAST,
+    MS,
+    PERIOD_NS,
+    START_NS,
+    joint_angle,
+    record_session,
+    rows,
+    run,
+    same,
+)
 
-from eisp_data.episode import Episode
 from eisp_data.errors import ConfigError, DataError
 from eisp_data.storage.lerobot import read_episodes
 from eisp_data.storage.mcap import assemble, messages
 from eisp_data.storage.mcap import convert as convert_module
 from eisp_data.storage.mcap.convert import (
     ConvertConfig,
-    ConvertReport,
     convert,
     suggested_mapping,
 )
-from eisp_data.storage.mcap.reader import McapLog
 from eisp_data.storage.mcap.writer import McapWriter
-
-
-def run(source: Path, target: Path, **changes: object) -> tuple[list[Episode], ConvertReport]:
-    """Convert and return the episodes, without images."""
-    report = convert(ConvertConfig(inputs=(source,), to=target, **changes))  # type: ignore[arg-type]
-    return list(read_episodes(target)), report
-
-
-def rows(root: Path) -> dict[str, np.ndarray]:
-    """Return the columns of a dataset, all rows."""
-    tables = [pq.read_table(path) for path in sorted(root.glob("data/*/*.parquet"))]
-    names = [n for n in tables[0].column_names if not n.startswith("eisp.")]
-    return {n: np.concatenate([np.array(t[n].to_pylist()) for t in tables]) for n in names}
-
-
-def same(a: Episode, b: Episode) -> bool:
-    """Return whether two episodes are equal in every array and in what is said of them."""
-    arrays = ("observation", "achieved_goal", "desired_goal", "action", "reward", "success", "done")
-    return all(np.array_equal(getattr(a, n), getattr(b, n)) for n in arrays) and a.info == b.info
 
 
 def test_each_row_holds_what_the_recording_says_at_its_time(
@@ -152,114 +139,6 @@ def test_another_recording_or_rule_cannot_be_resumed_into_a_dataset(tmp_path: Pa
         run(one, tmp_path / "d", resume=True, clock="log")
 
 
-def record(path: Path, events: list[tuple[str, float, dict]], seconds: float = 2.0) -> Path:
-    """Record joints and commands at 25 Hz for some seconds, with events at given seconds."""
-    with McapWriter(path, FAST) as writer:
-        for kind, at_s, details in events:
-            writer.event(kind, START_NS + round(at_s * 1e9), **details)
-        for k in range(int(seconds * 25) + 1):
-            at = START_NS + k * PERIOD_NS
-            angle = float(joint_angle(at))
-            writer.log("/joint_states", messages.joints(["a"], [angle], at), at)
-            writer.vector("/command", [k / 1000], at, role="action")
-            writer.vector("/reached", [angle], at, role="observation.achieved_goal")
-    return path
-
-
-def test_episodes_are_cut_at_their_events(tmp_path: Path) -> None:
-    source = record(
-        tmp_path / "x.mcap",
-        [
-            ("episode_start", 0.2, {"operator": "ann"}),
-            ("success", 0.5, {}),
-            ("episode_end", 0.6, {"outcome": "success"}),
-            ("episode_start", 0.8, {}),
-            ("episode_end", 1.0, {"outcome": "discard"}),
-            ("episode_start", 1.2, {}),
-            ("episode_start", 1.4, {}),
-            ("intervention_start", 1.48, {}),
-            ("intervention_end", 1.56, {}),
-        ],
-    )
-    episodes, report = run(source, tmp_path / "d")
-    assert [len(e) for e in episodes] == [10, 5, 15]
-    assert [e.info["outcome"] for e in episodes] == ["success", "", ""]
-    assert [e.info["complete"] for e in episodes] == [True, False, False]
-    assert [bool(e.done[-1]) for e in episodes] == [True, False, False]
-    assert [bool(e.truncated[-1]) for e in episodes] == [False, True, True]
-    assert episodes[0].info["operator"] == "ann" and episodes[0].info["success_mark"] is True
-    assert episodes[0].observation[0, 0] == pytest.approx(0.2)
-    assert any("discarded" in line for line in report.lines)
-    held = rows(tmp_path / "d")["intervention"][-15:]
-    assert np.flatnonzero(held).tolist() == [2, 3, 4]
-
-
-def test_without_events_the_whole_recording_is_one_episode(tmp_path: Path) -> None:
-    (episode,), _ = run(record(tmp_path / "x.mcap", []), tmp_path / "d")
-    assert len(episode) == 50 and episode.info["goal"] == "last achieved"
-    assert episode.success[-1] and episode.desired_goal.tolist() == [2.0]
-
-
-def test_the_reward_is_zero_exactly_where_the_goal_error_is_within_epsilon(tmp_path: Path) -> None:
-    (episode,), _ = run(record(tmp_path / "x.mcap", []), tmp_path / "d", epsilon_m=0.1)
-    near = np.abs(episode.achieved_goal[:, 0] - 2.0) <= np.float32(0.1)
-    assert np.array_equal(episode.success, near)
-    assert np.array_equal(episode.reward, np.where(near[1:], 0.0, -1.0))
-
-
-def test_a_goal_that_changes_starts_a_new_episode(tmp_path: Path) -> None:
-    with McapWriter(tmp_path / "y.mcap", FAST) as writer:
-        for k in range(26):
-            at = START_NS + k * PERIOD_NS
-            writer.log("/joint_states", messages.joints(["a"], [k], at), at)
-            writer.vector("/command", [0.0], at, role="action")
-            writer.vector("/reached", [k], at, role="observation.achieved_goal")
-            if k in (0, 10):
-                writer.vector("/goal", [k], at, role="observation.desired_goal")
-    episodes, _ = run(tmp_path / "y.mcap", tmp_path / "d")
-    assert [e.desired_goal.tolist() for e in episodes] == [[0.0], [10.0]]
-    assert [len(e) for e in episodes] == [10, 15]
-    # Both hold the observation at which the goal changed.
-    assert episodes[0].observation[-1, 0] == episodes[1].observation[0, 0] == 10
-    assert not episodes[0].done.any() and episodes[0].truncated[-1]
-
-
-def test_a_goal_said_an_instant_after_the_first_command_is_that_of_the_first_row(
-    tmp_path: Path,
-) -> None:
-    with McapWriter(tmp_path / "x.mcap", FAST) as writer:
-        for episode in range(2):
-            start = START_NS + episode * 2_000_000_000
-            writer.event("episode_start", start)
-            for k in range(10):
-                at = start + k * PERIOD_NS
-                writer.log("/joint_states", messages.joints(["a"], [k], at), at)
-                writer.vector("/reached", [k], at, role="observation.achieved_goal")
-                writer.vector("/command", [0.0], at, role="action")
-                if k == 0:
-                    late = at + 3 * MS
-                    writer.vector("/goal", [episode], late, role="observation.desired_goal")
-            writer.event("episode_end", at)
-    episodes, _ = run(tmp_path / "x.mcap", tmp_path / "d")
-    assert [(len(e), e.desired_goal.tolist()) for e in episodes] == [(9, [0.0]), (9, [1.0])]
-
-
-def test_a_jittering_control_loop_loses_and_doubles_no_command(tmp_path: Path) -> None:
-    rng = np.random.default_rng(3)
-    with McapWriter(tmp_path / "x.mcap", FAST) as writer:
-        writer.event("episode_start", START_NS - MS)
-        for k in range(101):
-            seen = START_NS + k * PERIOD_NS + int(rng.uniform(-5, 5) * MS) * (k > 0)
-            writer.vector("/state", [k], seen, role="observation.state")
-            writer.vector("/reached", [k], seen, role="observation.achieved_goal")
-            if k < 100:
-                writer.vector("/command", [k / 100], seen + 6 * MS, role="action")
-        writer.event("episode_end", seen + MS)
-    (episode,), _ = run(tmp_path / "x.mcap", tmp_path / "d")
-    np.testing.assert_allclose(episode.action[:, 0], np.arange(100) / 100, atol=1e-7)
-    assert len(episode) == 100
-
-
 def test_a_sensor_on_another_clock_is_named_with_the_way_out(tmp_path: Path) -> None:
     with McapWriter(tmp_path / "x.mcap", FAST) as writer:
         for k in range(10):
@@ -270,82 +149,6 @@ def test_a_sensor_on_another_clock_is_named_with_the_way_out(tmp_path: Path) -> 
             writer.vector("/reached", [k], at, role="observation.achieved_goal")
     with pytest.raises(DataError, match=r"/joint_states begins -1\.7e\+09 s .* set clock: log"):
         run(tmp_path / "x.mcap", tmp_path / "d")
-
-
-def test_a_dead_camera_is_reported_and_its_age_grows(tmp_path: Path) -> None:
-    with McapWriter(tmp_path / "x.mcap", FAST) as writer:
-        writer.event("episode_start", START_NS)
-        for k in range(51):
-            at = START_NS + k * PERIOD_NS
-            writer.log("/joint_states", messages.joints(["a"], [k], at), at)
-            writer.vector("/command", [0.0], at, role="action")
-            writer.vector("/reached", [k], at, role="observation.achieved_goal")
-            if k <= 20:
-                writer.image("/camera/top", np.zeros((16, 16, 3), np.uint8), at)
-        writer.event("episode_end", at)
-    (episode,), report = run(tmp_path / "x.mcap", tmp_path / "d")
-    assert len(episode) == 50 and episode.info["gaps"] == 1
-    (line,) = report.lines
-    assert "camera.top: no sample for 1.20 s, from 0.80 s on" in line
-    assert rows(tmp_path / "d")["age_s.camera.top"][-1] == pytest.approx(29 * 0.04, abs=1e-5)
-
-
-def test_rows_with_a_source_older_than_its_limit_are_left_out(tmp_path: Path) -> None:
-    with McapWriter(tmp_path / "y.mcap", FAST) as writer:
-        for k in range(51):
-            at = START_NS + k * PERIOD_NS
-            writer.log("/joint_states", messages.joints(["a"], [k], at), at)
-            writer.vector("/command", [0.0], at)
-            if not 20 < k < 30:
-                writer.vector("/reached", [k], at)
-    (tmp_path / "m.yaml").write_text(
-        "streams:\n"
-        "  - {topic: /joint_states, to: observation.state}\n"
-        "  - {topic: /reached, to: observation.achieved_goal, max_age_s: 0.1}\n"
-        "  - {topic: /command, to: action}\n"
-    )
-    episodes, report = run(tmp_path / "y.mcap", tmp_path / "d", mapping=tmp_path / "m.yaml")
-    assert [len(e) for e in episodes] == [22, 20]
-    assert any("7 rows with a source too old" in line for line in report.lines)
-
-
-def test_a_recording_that_was_cut_off_gives_the_episodes_that_are_left(
-    session_file: Path, tmp_path: Path
-) -> None:
-    with McapLog(session_file) as log:
-        last_chunk = log.layout.segments[-1].offset
-    (tmp_path / "cut.mcap").write_bytes(session_file.read_bytes()[: last_chunk + 100])
-    episodes, report = run(tmp_path / "cut.mcap", tmp_path / "d")
-    whole, _ = run(session_file, tmp_path / "w")
-    assert np.array_equal(episodes[0].observation, whole[0].observation)
-    assert len(episodes) == 2 and not episodes[1].info["complete"]
-    kept = len(episodes[1])
-    assert 5 < kept < 20 and np.array_equal(episodes[1].action, whole[1].action[:kept])
-    assert any("cut off" in line for line in report.lines)
-
-
-def test_a_damaged_chunk_is_named_in_the_report(session_file: Path, tmp_path: Path) -> None:
-    with McapLog(session_file) as log:
-        chunk = log.layout.segments[2]
-    data = bytearray(session_file.read_bytes())
-    data[chunk.offset + 300] ^= 1
-    (tmp_path / "bad.mcap").write_bytes(data)
-    _, report = run(tmp_path / "bad.mcap", tmp_path / "d")
-    assert any(f"bad.mcap: byte {chunk.offset}" in line for line in report.lines)
-
-
-def test_samples_that_are_not_finite_count_as_missing(tmp_path: Path) -> None:
-    with McapWriter(tmp_path / "x.mcap", FAST) as writer:
-        for k in range(26):
-            at = START_NS + k * PERIOD_NS
-            reading = float("nan") if k == 7 else float(k)
-            writer.log("/joint_states", messages.joints(["a"], [reading], at), at)
-            writer.vector("/command", [0.0], at, role="action")
-            writer.vector("/reached", [k], at, role="observation.achieved_goal")
-    (episode,), report = run(tmp_path / "x.mcap", tmp_path / "d")
-    assert episode.observation[7, 0] == pytest.approx(7.0)
-    assert rows(tmp_path / "d")["age_s.joint_states.state"][7] == pytest.approx(0.04)
-    assert any("1 samples not finite left out" in line for line in report.lines)
 
 
 def test_subgoals_become_a_column_of_their_own(tmp_path: Path) -> None:

@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eisp_data.storage.mcap.chain import compose, multiply, rotate
-from eisp_data.storage.mcap.resample import gaps, make_series, pick, resample, slerp
+from eisp_data.storage.mcap.collect import lost_before
+from eisp_data.storage.mcap.resample import gaps, make_series, pick, resample, slerp, stands_in
 
 MS = 1_000_000
 
@@ -126,3 +127,36 @@ def test_a_composed_pose_maps_a_point_as_the_two_poses_do_in_turn(
 def test_turns_about_one_axis_add_up(a: float, b: float) -> None:
     product = multiply(about_z(a)[None], about_z(b)[None])[0]
     np.testing.assert_allclose(product, about_z(a + b), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("rule", "wanted"),
+    [("hold", [False, True, True, False]), ("nearest", [True, True, False, False])],
+)
+def test_rows_that_a_lost_sample_would_have_served_are_found(rule: str, wanted: list[bool]) -> None:
+    series = series_at([0, 40, 120, 160])
+    ticks = np.array([79, 80, 119, 120]) * MS
+    for lost in ([0, 0, 0, 0], [0, 0, 1, 0]):
+        assert stands_in(series, np.array(lost), ticks, rule).tolist() == wanted
+
+
+def test_sequence_numbers_find_what_an_unsteady_source_lost() -> None:
+    series = series_at([0, 40, 80, 100, 200])
+    ticks = np.arange(0, 200, 10) * MS
+    assert not stands_in(series, np.zeros(5, np.int64), ticks, "hold")[:12].any()
+    found = stands_in(series, np.array([0, 0, 1, 0, 0]), ticks, "hold")
+    assert np.flatnonzero(found[:12]).tolist() == [6, 7]
+
+
+def test_sequence_numbers_that_do_not_count_say_nothing() -> None:
+    assert lost_before(np.array([0, 1, 4, 5, 6])).tolist() == [0, 0, 2, 0, 0]
+    assert not lost_before(np.zeros(5, np.int64)).any()
+    assert not lost_before(np.arange(0, 50, 10)).any()
+    assert not lost_before(np.array([7])).any()
+
+
+@given(times, st.integers(1, 50), st.sampled_from(["hold", "nearest"]))
+def test_a_row_at_a_sample_never_stands_in(times_ms: list[int], count: int, rule: str) -> None:
+    series = series_at(times_ms)
+    lost = np.full(len(times_ms), count)
+    assert not stands_in(series, lost, series.times_ns, rule).any()
