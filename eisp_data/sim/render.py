@@ -45,7 +45,7 @@ class Renderer:
         model.vis.global_.offheight = max(model.vis.global_.offheight, height)
         self._model, self._data = model, mujoco.MjData(model)
         self._colours = _colours(task)
-        self._gl = _open_gl(width, height)
+        self._gl = open_gl(width, height)
         self._gl.make_current()
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
@@ -129,7 +129,7 @@ def _colours(task: Task) -> list[np.ndarray]:
     return colours
 
 
-def _open_gl(width: int, height: int) -> Any:
+def open_gl(width: int, height: int) -> Any:
     """Return an OpenGL context: EGL on Linux, unless MUJOCO_GL says otherwise."""
     if sys.platform == "linux":
         os.environ.setdefault("MUJOCO_GL", "egl")
