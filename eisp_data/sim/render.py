@@ -44,7 +44,7 @@ class Renderer:
         model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
         model.vis.global_.offheight = max(model.vis.global_.offheight, height)
         self._model, self._data = model, mujoco.MjData(model)
-        self._colours = _colours(task)
+        self._colours = object_colours(task)
         self._gl = open_gl(width, height)
         self._gl.make_current()
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
@@ -116,8 +116,8 @@ class Renderer:
         self.close()
 
 
-def _colours(task: Task) -> list[np.ndarray]:
-    """Return the colour (3,) of each object of the goal: that of the geom of its name."""
+def object_colours(task: Task) -> list[np.ndarray]:
+    """Return the colour (3,), 0 to 1, of each object of the goal: that of the geom of its name."""
     model, seen, colours = task.model, Counter[str](), []
     names = {model.geom(index).name for index in range(model.ngeom)}
     for slot in task.objects:
