@@ -6,14 +6,20 @@ what      keyboard                               gamepad
 move      arrow keys                             left stick
 up, down  right shift, left shift                right stick
 fingers   right ctrl opens, left ctrl closes     LT opens, RB closes
-outcome   s success, q failure, r record again   Y success, X failure, A again
+outcome   s success, q failure, r record again   Y success, A failure, X again
 take over any of the keys that move              RB (or R1)
 ========  =====================================  ==================================
 """
 
 from __future__ import annotations
 
+import contextlib
+import logging
+import os
+import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any, Literal
 
 import numpy as np
@@ -53,7 +59,8 @@ class Teleop:
         self.device = device
         self._source: Any = _make(device)
         self._held: set[str] = set()
-        self._source.connect()
+        with _silence():
+            self._source.connect()
         if not self._connected():
             self.close()
             raise RobotError(
@@ -117,12 +124,32 @@ def _make(device: Device) -> Any:
             )
 
             return KeyboardEndEffectorTeleop(KeyboardEndEffectorTeleopConfig())
-        import pygame  # noqa: F401 - LeRobot would only ask for it once connected
+        _quiet_pygame()
         from lerobot.teleoperators.gamepad import GamepadTeleop, GamepadTeleopConfig
 
         return GamepadTeleop(GamepadTeleopConfig())
     except ImportError:
         raise ConfigError(f"{device}: not installed; pip install 'eisp[teleop]'") from None
+
+
+def _quiet_pygame() -> None:
+    """Import pygame, which LeRobot needs once it connects, without greeting, sound or window."""
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    os.environ.setdefault("SDL_AUDIODRIVER", "dummy")
+    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+    with warnings.catch_warnings(action="ignore"):
+        import_module("pygame")
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Keep back what LeRobot logs about a missing device: an error says it in one line."""
+    logging.disable(logging.ERROR)
+    try:
+        yield
+    finally:
+        logging.disable(logging.NOTSET)
 
 
 def _outcome(events: dict[Any, Any]) -> str | None:
