@@ -24,8 +24,6 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
-
 from eisp_data.robots.robot import CameraFrame, JointCommand, Reading, Robot
 from eisp_data.storage.mcap import messages
 from eisp_data.storage.mcap.writer import McapWriter, McapWriterConfig, WriterStats
