@@ -18,13 +18,13 @@ from torch import Tensor
 from tqdm import tqdm
 
 from eisp_data.errors import ConfigError
+from eisp_data.runs.metrics import MetricsLog
 from eisp_data.sim.gym_worlds import AnyWorlds
 from finetune.config import OnlineConfig
 from finetune.evaluate import Evaluation, evaluate
 from finetune.rollout import SubgoalPolicy
 from pretrain import checkpoint
 from pretrain.agent import Agent
-from pretrain.metrics import MetricsLog
 from pretrain.replay import Trajectories
 from pretrain.sac import Batch, SacOptimizer
 from pretrain.saved import POLICY

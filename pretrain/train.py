@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from eisp_data.config import save_yaml
 from eisp_data.errors import ConfigError, DataError
+from eisp_data.runs.metrics import MetricsLog
 from eisp_data.storage.cache import DatasetArrays, load_arrays
 from eisp_data.tasks.registry import TASKS
 from pretrain import checkpoint
@@ -20,7 +21,6 @@ from pretrain.checks import check_pretrain
 from pretrain.config import PretrainConfig
 from pretrain.device import describe, set_up
 from pretrain.layout import Layout
-from pretrain.metrics import MetricsLog
 from pretrain.replay import Trajectories
 from pretrain.sac import SacOptimizer
 

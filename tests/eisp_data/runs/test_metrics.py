@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from pretrain.metrics import MetricsLog
+from eisp_data.runs.metrics import MetricsLog
 
 
 def lines_of(run: Path) -> list[tuple[str, int]]:

@@ -1,0 +1,5 @@
+"""What every training run needs: a folder, a device, metrics and checkpoints."""
+
+from typing import Literal
+
+DeviceName = Literal["auto", "cpu", "cuda"]
