@@ -19,6 +19,7 @@ from pretrain.proposers.hybrid import Hybrid
 from pretrain.proposers.movers import Movers
 from pretrain.proposers.proposer import SubgoalProposer
 from pretrain.sac import Sac
+from pretrain.saved import writing
 
 BANK = 4096
 """Achieved goals of the dataset that an agent carries with it, for random subgoals."""
@@ -63,9 +64,10 @@ class Agent(nn.Module):
         """Write ``config.json`` and ``model.safetensors``, each whole or not at all."""
         # Modules share the feature buffers; a file must not.
         tensors = {name: value.clone().contiguous() for name, value in self.state_dict().items()}
-        replace_atomically(folder / "model.safetensors", lambda path: save_file(tensors, path))
         plain = {"agent": to_plain(self.config), "layout": to_plain(self.layout)}
-        write_json(folder / "config.json", plain)
+        with writing(folder):
+            replace_atomically(folder / "model.safetensors", lambda path: save_file(tensors, path))
+            write_json(folder / "config.json", plain)
 
     @classmethod
     def load(cls, folder: Path, device: str = "cpu") -> Agent:

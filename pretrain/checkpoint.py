@@ -22,7 +22,7 @@ from torch import Tensor
 from eisp_data.errors import DataError
 from eisp_data.storage.files import one_line, sync
 from pretrain.agent import Agent
-from pretrain.saved import POLICY
+from pretrain.saved import POLICY, writing
 
 _STATE = "training_state"
 _KEPT = 2
@@ -47,35 +47,50 @@ def save(
         rng: the run's generator.
         numbers: JSON values.
         arrays: whatever else must be restored.
+
+    Raises:
+        DataError: the disk is full or cannot be written to; the checkpoints before are whole.
     """
     folder = run / "checkpoints" / f"{step:06d}"
     draft = folder.with_name(f".{folder.name}.draft")
     shutil.rmtree(draft, ignore_errors=True)
-    agent.save(draft / POLICY)
-    state = draft / _STATE
-    state.mkdir()
+    plain = {"step": step, "rng": rng.bit_generator.state, "numbers": dict(numbers)}
     tensors = {"torch_rng": torch.get_rng_state()} | _flatten(optimizers)
-    # Contiguous and unshared, as the format wants them.
-    plain = {name: np.array(value.cpu().numpy(), order="C") for name, value in tensors.items()}
-    save_arrays(
-        plain | {f"array/{k}": np.array(v, order="C") for k, v in arrays.items()},
-        state / "state.safetensors",
-    )
-    (state / "state.json").write_text(
-        json.dumps({"step": step, "rng": rng.bit_generator.state, "numbers": dict(numbers)})
-    )
-    for path in (*state.iterdir(), state, draft / POLICY, draft):
-        sync(path)
-    shutil.rmtree(folder, ignore_errors=True)
-    draft.rename(folder)
-    link = folder.with_name(".last")
-    link.unlink(missing_ok=True)
-    link.symlink_to(folder.name)
-    link.rename(folder.with_name("last"))
-    sync(folder.parent)
+    try:
+        agent.save(draft / POLICY)
+        with writing(folder):
+            _write_state(draft / _STATE, plain, tensors, arrays)
+            for path in (draft / POLICY, draft):
+                sync(path)
+            shutil.rmtree(folder, ignore_errors=True)
+            draft.rename(folder)
+            link = folder.with_name(".last")
+            link.unlink(missing_ok=True)
+            link.symlink_to(folder.name)
+            link.rename(folder.with_name("last"))
+            sync(folder.parent)
+    except DataError:
+        shutil.rmtree(draft, ignore_errors=True)  # a full disk has better use for the room
+        raise
     steps = [path for path in folder.parent.iterdir() if path.name.isdigit()]
     for old in sorted(steps, key=lambda path: int(path.name))[:-_KEPT]:
         shutil.rmtree(old)
+
+
+def _write_state(
+    state: Path,
+    plain: Mapping[str, Any],
+    tensors: Mapping[str, Tensor],
+    arrays: Mapping[str, np.ndarray],
+) -> None:
+    state.mkdir()
+    # Contiguous and unshared, as the format wants them.
+    own = {name: np.array(value.cpu().numpy(), order="C") for name, value in tensors.items()}
+    others = {f"array/{name}": np.array(value, order="C") for name, value in arrays.items()}
+    save_arrays(own | others, state / "state.safetensors")
+    (state / "state.json").write_text(json.dumps(plain))
+    for path in (*state.iterdir(), state):
+        sync(path)
 
 
 def restore(

@@ -212,7 +212,7 @@ def _fill(root: Path, spec: DatasetSpec, folder: Path) -> None:
         "seed": ((episodes,), "<i8"),
     }
     out = {
-        name: np.lib.format.open_memmap(folder / f"{name}.npy", "w+", dtype, shape)
+        name: _new_map(folder / f"{name}.npy", shape, dtype)
         if 0 not in shape
         else np.zeros(shape, dtype)
         for name, (shape, dtype) in shapes.items()
@@ -228,6 +228,18 @@ def _fill(root: Path, spec: DatasetSpec, folder: Path) -> None:
             np.save(folder / f"{name}.npy", array)
     np.save(folder / "episode_start.npy", starts.astype(np.int64))
     (folder / "info.json").write_text(json.dumps(info))
+
+
+def _new_map(path: Path, shape: tuple[int, ...], dtype: str) -> np.ndarray:
+    """Return a new file of zeros, mapped, with its room on the disk already taken.
+
+    Without, the file is a hole, and filling it on a full disk kills the process with SIGBUS.
+    """
+    array = np.lib.format.open_memmap(path, "w+", dtype, shape)
+    if hasattr(os, "posix_fallocate"):  # macOS has none
+        with path.open("r+b") as file:
+            os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
+    return array
 
 
 def _fill_block(out: dict[str, np.ndarray], block: Block, starts: np.ndarray) -> None:
@@ -266,7 +278,7 @@ def _fill_images(root: Path, camera: str, folder: Path) -> None:
     spec, index = read_spec(root), read_index(root)
     rows = int((index.length + 1).sum())
     shape = (rows, *spec.cameras[camera], 3)
-    out = np.lib.format.open_memmap(folder / "images.npy", "w+", np.uint8, shape)
+    out = _new_map(folder / "images.npy", shape, "|u1")
     row = 0
     for episode in read_episodes(root, images=True):
         out[row : row + len(episode) + 1] = episode.images[camera]

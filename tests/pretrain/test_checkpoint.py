@@ -175,3 +175,25 @@ def test_a_run_without_a_checkpoint_says_so(tmp_path):
     assert not checkpoint.exists(tmp_path)
     with pytest.raises(DataError, match="holds no policy"):
         Training().restore(tmp_path)
+
+
+def test_a_full_disk_is_one_line_and_the_checkpoint_before_stays_whole(small_disk):
+    run = small_disk("400k")
+    training = Training()
+    training.learn()
+    training.save(run, 1)
+    needed = sum(-(-path.stat().st_size // 4096) for path in run.rglob("*.*"))
+    fill = run / "fill"
+    failed = set()
+    for room in range(1, needed):  # in blocks: each of its files is once the one without room
+        free = os.statvfs(run).f_bavail * os.statvfs(run).f_frsize
+        fill.write_bytes(bytes(free - room * 4096))
+        with pytest.raises(DataError, match=r"cannot be written: .*No space left") as caught:
+            training.save(run, 2)
+        assert "\n" not in str(caught.value)
+        failed.add(str(caught.value).split(" cannot")[0])
+        assert steps_of(run) == ["000001", "last"]
+        fill.unlink()
+    assert len(failed) == 2, "the policy, and the training state"
+    training.save(run, 2)
+    assert steps_of(run) == ["000001", "000002", "last"]

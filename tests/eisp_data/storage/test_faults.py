@@ -147,12 +147,6 @@ def test_a_kill_at_any_moment_loses_at_most_the_batch_in_hand(tmp_path, monkeypa
         assert all(check.passed for check in validate(root))
 
 
-def _mount_tmpfs(folder: Path, size: str) -> bool:
-    folder.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
-    return subprocess.run(command, capture_output=True).returncode == 0
-
-
 def _fill_up(root: Path) -> tuple[int, str]:
     """Write batches until the disk is full; return how many episodes were promised."""
     spec = spec_of(cameras=True)
@@ -174,16 +168,38 @@ def _check_full(root: Path, promised: int, message: str) -> None:
     assert all(check.passed for check in validate(root))
 
 
-def test_a_full_disk_is_one_clear_line_and_the_finished_part_is_whole(tmp_path):
-    folder = tmp_path / "small"
-    if not _mount_tmpfs(folder, "700k"):
-        pytest.skip("mounting a tmpfs needs privileges that this process has not")
-    try:
-        promised, message = _fill_up(folder / "dataset")
-        assert "No space left on device" in message
-        _check_full(folder / "dataset", promised, message)
-    finally:
-        subprocess.run(["umount", str(folder)], check=True)
+def test_a_full_disk_is_one_clear_line_and_the_finished_part_is_whole(small_disk):
+    root = small_disk("700k") / "dataset"
+    promised, message = _fill_up(root)
+    assert "No space left on device" in message
+    _check_full(root, promised, message)
+
+
+def test_a_full_disk_stops_the_array_cache_in_one_line(small_disk, make_dataset):
+    """In a process of its own: a mapped file without room would kill it."""
+    root, _ = make_dataset(count=20, cameras=True)
+    folder = small_disk("60k")
+    code = (
+        "import sys\n"
+        "from eisp_data.errors import DataError\n"
+        "from eisp_data.storage.cache import load_arrays, load_images\n"
+        "for load in (load_arrays, lambda root: load_images(root, 'top')):\n"
+        "    try:\n"
+        "        load(sys.argv[1])\n"
+        "    except DataError as error:\n"
+        "        print(error)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(root)],
+        env={**os.environ, "EISP_CACHE": str(folder)},
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    lines = done.stdout.splitlines()
+    assert len(lines) == 2, lines
+    assert all("cannot write the array cache" in x and "No space left" in x for x in lines)
+    assert not [path for path in folder.rglob("*") if path.is_file()]
 
 
 def test_a_file_that_may_not_grow_is_one_clear_line(tmp_path):

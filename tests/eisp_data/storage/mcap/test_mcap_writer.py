@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from eisp_data.storage.mcap import messages
 from eisp_data.storage.mcap import writer as writer_module
 from eisp_data.storage.mcap.backlog import Backlog, Item
 from eisp_data.storage.mcap.reader import McapLog
+from eisp_data.storage.mcap.repair import repair
 from eisp_data.storage.mcap.writer import McapWriter, McapWriterConfig
 
 
@@ -187,7 +189,8 @@ FULL_DISK = """
 import resource, sys
 from eisp_data.errors import DataError
 from eisp_data.storage.mcap.writer import McapWriter, McapWriterConfig
-resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
+if len(sys.argv) > 2:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]),) * 2)
 config = McapWriterConfig(compression="none", chunk_bytes=4096, flush_s=0.01)
 writer = McapWriter(sys.argv[1], config)
 try:
@@ -202,15 +205,32 @@ except DataError as error:
 """
 
 
-def test_a_disk_that_is_full_stops_the_recording_with_one_line_and_leaves_what_was_written(
-    tmp_path: Path,
-) -> None:
-    path = tmp_path / "run.mcap"
+def record_until_full(path: Path, *limit: str) -> None:
+    """Record until the disk is full; check that it is said, and what is left."""
     done = subprocess.run(
-        [sys.executable, "-c", FULL_DISK, str(path)], capture_output=True, text=True, timeout=60
+        [sys.executable, "-c", FULL_DISK, str(path), *limit],
+        capture_output=True,
+        text=True,
+        timeout=60,
     )
     lines = done.stdout.splitlines()
     assert len(lines) == 2 and all("recording stopped" in line for line in lines), done.stderr
     with McapLog(path) as log:
-        assert log.stats()["/camera"].count > 100
+        count = log.stats()["/camera"].count
+        assert count > 100
         assert any("cut off" in problem for problem in log.problems)
+    report = repair(path, path.parent.parent / "copy.mcap")
+    with report.copy.open("rb") as file:
+        assert sum(1 for _ in make_reader(file, validate_crcs=True).iter_messages()) >= count
+
+
+def test_a_full_disk_stops_the_recording_with_one_line_and_leaves_what_was_written(
+    small_disk: Callable[[str], Path],
+) -> None:
+    record_until_full(small_disk("300k") / "run.mcap")
+
+
+def test_a_recording_that_may_not_grow_stops_with_one_line_too(tmp_path: Path) -> None:
+    """The same without privileges: a limit on the size of files, as a quota sets it."""
+    (tmp_path / "small").mkdir()
+    record_until_full(tmp_path / "small/run.mcap", "200000")
