@@ -40,7 +40,7 @@ def finetune(config: FinetuneConfig) -> dict[str, float]:
     _check(config)
     resumed = has_progress(run, config.resume, "finetune.yaml")
     device = set_up(config.device, config.threads)
-    print(describe(device), flush=True)
+    print(describe(device, config.threads), flush=True)
     torch.manual_seed(config.seed)
     if config.policy.path is None:
         if config.env.id is None:
@@ -63,6 +63,7 @@ def finetune(config: FinetuneConfig) -> dict[str, float]:
         config.online,
         config.seed,
         device,
+        config.threads,
     )
     begin_run(run, config, "finetune.yaml")
     if config.policy.path and not resumed:

@@ -25,10 +25,10 @@ from finetune.evaluate import Evaluation, evaluate
 from finetune.rollout import SubgoalPolicy
 from pretrain import checkpoint
 from pretrain.agent import Agent
+from pretrain.learner import Learner
 from pretrain.replay import Trajectories
-from pretrain.sac import Batch, SacOptimizer
+from pretrain.sac import Batch
 from pretrain.saved import POLICY
-from pretrain.train import update_generator
 
 _SELECTION_SEED = 500_000_000
 """Seeds from here on choose among checkpoints; none of them is ever reported on."""
@@ -110,6 +110,7 @@ class Finetuner:
         config: the hyperparameters.
         seed: of the run.
         device: where the agent is.
+        threads: how many cores an update may use.
     """
 
     def __init__(
@@ -121,6 +122,7 @@ class Finetuner:
         config: OnlineConfig,
         seed: int,
         device: str,
+        threads: int,
     ) -> None:
         self.run, self.agent, self.config = run, agent, config
         self._mix, self._device = agent.config.mix, device
@@ -130,10 +132,7 @@ class Finetuner:
         self._online = Trajectories(
             agent.layout, config.replay_size, agent.config.waypoints, purposeful=False
         )
-        self._sac = SacOptimizer(agent.sac, config.lr)
-        self._generator = torch.optim.Adam(
-            agent.proposer.parameters(), lr=config.generator_lr, fused=True
-        )
+        self._learner = Learner(agent, config.lr, config.generator_lr, threads)
         worlds = make_worlds(config.worlds)
         if worlds.episode_steps % config.round_steps:
             raise ConfigError(
@@ -181,15 +180,15 @@ class Finetuner:
             parts = [self._online.transitions(config.batch_size - offline, self._mix, self._rng)]
             if offline:
                 parts.append(self._offline.transitions(offline, self._mix, self._rng))
-            batch = Batch.joined(parts).to(self._device)
-            info |= self._sac.update(batch, config.cloning)
+            hindsight = None
             if config.generator_every and update % config.generator_every == 0:
                 source = self._offline
                 if not offline or self._rng.random() >= config.offline_share:
                     source = self._online
                 if len(source.leading):
                     count = config.generator_batch_size
-                    info |= update_generator(self.agent, self._generator, source, count, self._rng)
+                    hindsight = source.subgoals(count, self._mix, self._rng)
+            info |= self._learner.update(Batch.joined(parts), config.cloning, hindsight)
         return info
 
     def _evaluate(self, log: MetricsLog, info: dict[str, Tensor], start: float) -> Evaluation:
@@ -218,14 +217,6 @@ class Finetuner:
     def _points(self) -> list[dict[str, float]]:
         return [{k: v for k, v in p.items() if k != "env_steps"} for p in self._curve]
 
-    @property
-    def _optimizers(self) -> dict[str, torch.optim.Optimizer]:
-        return {
-            "actor": self._sac.actor,
-            "critic": self._sac.critic,
-            "generator": self._generator,
-        }
-
     def _checkpoint(self) -> None:
         online = self._online
         arrays = self._rollouts.state() | {
@@ -236,12 +227,12 @@ class Finetuner:
         }
         numbers = {"curve": self._curve, "wall_s": self._spent}
         checkpoint.save(
-            self.run, self._round, self.agent, self._optimizers, self._rng, numbers, arrays
+            self.run, self._round, self.agent, self._learner.optimizers, self._rng, numbers, arrays
         )
 
     def _restore(self) -> None:
         self._round, numbers, arrays = checkpoint.restore(
-            self.run, self.agent, self._optimizers, self._rng
+            self.run, self.agent, self._learner.optimizers, self._rng
         )
         self._curve, self._spent = numbers["curve"], numbers["wall_s"]
         names = ("observation", "achieved_goal", "action", "episode_start")

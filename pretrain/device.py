@@ -16,18 +16,19 @@ def set_up(device: DeviceName, threads: int) -> str:
 
     Args:
         device: ``auto`` takes CUDA where there is one.
-        threads: for the processor.
+        threads: cores of the processor, shared by the two halves of an update (see
+            ``pretrain.learner``).
     """
     if device == "cuda" and not torch.cuda.is_available():
         raise ConfigError("--device cuda: this torch sees no CUDA device; choose auto or cpu")
     chosen = "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
-    torch.set_num_threads(threads)
+    torch.set_num_threads(max(1, threads // 2))
     torch.set_float32_matmul_precision("medium")
     return chosen
 
 
-def describe(device: str) -> str:
+def describe(device: str, threads: int) -> str:
     """Return one line that says what is used."""
     if device == "cuda":
         return f"networks on {torch.cuda.get_device_name()}, physics on {default_threads()}"
-    return f"networks on {torch.get_num_threads()} thread(s), physics on {default_threads()}"
+    return f"networks on {threads} thread(s), physics on {default_threads()}"

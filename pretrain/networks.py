@@ -40,9 +40,9 @@ class EnsembleMLP(nn.Module):
             bound = size_in**-0.5
             self.weights.append(torch.empty(members, size_in, size_out).uniform_(-bound, bound))
             self.biases.append(torch.empty(members, 1, size_out).uniform_(-bound, bound))
-            if layer_norm:
-                self.scales.append(torch.ones(members, 1, size_out))
-                self.shifts.append(torch.zeros(members, 1, size_out))
+        for size in layers if layer_norm else ():
+            self.scales.append(torch.ones(members, 1, size))
+            self.shifts.append(torch.zeros(members, 1, size))
 
     def forward(self, inputs: Tensor) -> Tensor:
         """Return (members, B) values of (B, inputs) features."""

@@ -45,7 +45,7 @@ class Batch:
         """Return one batch of all the parts."""
         return cls(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(cls)))
 
-    def to(self, device: str) -> Batch:
+    def to(self, device: torch.device) -> Batch:
         """Return the batch on a device."""
         return Batch(*(getattr(self, f.name).to(device) for f in fields(self)))
 
@@ -53,20 +53,24 @@ class Batch:
 class Actor(nn.Module):
     """A Gaussian squashed by tanh."""
 
-    def __init__(self, features: nn.Module, size: int, layers: Sequence[int], actions: int) -> None:
+    def __init__(self, size: int, layers: Sequence[int], actions: int) -> None:
         super().__init__()
-        self.features = features
         self.body = mlp(size, layers, 2 * actions)
 
-    def forward(self, observation: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, seen: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and log standard deviation, each (B, A), before the tanh."""
-        mean, log_std = self.body(self.features(observation, goal)).chunk(2, -1)
+        mean, log_std = self.body(seen).chunk(2, -1)
         return mean, log_std.clamp(_LOG_STD_MIN, _LOG_STD_MAX)
 
-    def sample(self, observation: Tensor, goal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return a sampled action (B, A), its log-probability (B,) and the mean action (B, A)."""
-        mean, log_std = self(observation, goal)
-        noise = torch.randn_like(mean)
+    def sample(self, seen: Tensor, noise: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """Return a sampled action (B, A), its log-probability (B,) and the mean action (B, A).
+
+        Args:
+            seen: (B, F) features.
+            noise: (B, A) standard normal; drawn if left out.
+        """
+        mean, log_std = self(seen)
+        noise = torch.randn_like(mean) if noise is None else noise
         before = mean + noise * log_std.exp()
         # log N(before) - log |d tanh / d before|, the latter in its stable form.
         log_prob = -0.5 * noise.square() - log_std - 0.9189385332046727
@@ -77,16 +81,13 @@ class Actor(nn.Module):
 class Critic(nn.Module):
     """Twin action values."""
 
-    def __init__(
-        self, features: nn.Module, size: int, layers: Sequence[int], actions: int, layer_norm: bool
-    ) -> None:
+    def __init__(self, size: int, layers: Sequence[int], actions: int, layer_norm: bool) -> None:
         super().__init__()
-        self.features = features
         self.body = EnsembleMLP(2, size + actions, layers, layer_norm=layer_norm)
 
-    def forward(self, observation: Tensor, goal: Tensor, action: Tensor) -> Tensor:
-        """Return (2, B) values."""
-        return self.body(torch.cat([self.features(observation, goal), action], -1))
+    def forward(self, seen: Tensor, action: Tensor) -> Tensor:
+        """Return (2, B) values of (B, F) features and (B, A) actions."""
+        return self.body(torch.cat([seen, action], -1))
 
 
 class Sac(nn.Module):
@@ -102,10 +103,10 @@ class Sac(nn.Module):
         super().__init__()
         size = features.size
         assert isinstance(size, int)
-        self.config = config
-        self.actor = Actor(features, size, config.layers, actions)
-        self.critic = Critic(features, size, config.layers, actions, config.layer_norm)
-        self.target = Critic(features, size, config.layers, actions, config.layer_norm)
+        self.config, self.features = config, features
+        self.actor = Actor(size, config.layers, actions)
+        self.critic = Critic(size, config.layers, actions, config.layer_norm)
+        self.target = Critic(size, config.layers, actions, config.layer_norm)
         self.target.load_state_dict(self.critic.state_dict())
         self.target.requires_grad_(False)
 
@@ -117,43 +118,56 @@ class Sac(nn.Module):
     @torch.no_grad()
     def act(self, observation: Tensor, goal: Tensor, *, explore: bool) -> Tensor:
         """Return (B, A) actions: a sample if exploring, else the mean."""
-        action, _, mean = self.actor.sample(observation, goal)
+        action, _, mean = self.actor.sample(self.features(observation, goal))
         return action if explore else mean
 
     @torch.no_grad()
     def value(self, observation: Tensor, goal: Tensor) -> Tensor:
         """Return V(s, g) = E_a [min Q(s, g, a) - alpha log pi(a | s, g)], one sample, (B,)."""
-        action, log_prob, _ = self.actor.sample(observation, goal)
-        return self.critic(observation, goal, action).amin(0) - self.config.alpha * log_prob
+        seen = self.features(observation, goal)
+        action, log_prob, _ = self.actor.sample(seen)
+        return self.critic(seen, action).amin(0) - self.config.alpha * log_prob
 
-    def critic_loss(self, batch: Batch) -> tuple[Tensor, Info]:
-        """Return the mean squared Bellman error of both critics."""
+    def critic_loss(self, batch: Batch, noise: Tensor) -> tuple[Tensor, Info]:
+        """Return the mean squared Bellman error of both critics.
+
+        Args:
+            batch: of transitions.
+            noise: (B, A) standard normal, for the actions that follow.
+        """
         with torch.no_grad():
-            action, log_prob, _ = self.actor.sample(batch.next_observation, batch.goal)
-            following = self.target(batch.next_observation, batch.goal, action).amin(0)
+            then = self.features(batch.next_observation, batch.goal)
+            action, log_prob, _ = self.actor.sample(then, noise)
+            following = self.target(then, action).amin(0)
             following = following - self.config.alpha * log_prob
             target = batch.reward + self.config.gamma * following
             if self.config.clip_targets:
                 target = target.clamp(self.lowest_value, 0.0)
-        value = self.critic(batch.observation, batch.goal, batch.action)
+        value = self.critic(self.features(batch.observation, batch.goal), batch.action)
         loss = (value - target).square().mean()
         return loss, {"critic_loss": loss.detach(), "value": value.detach().mean()}
 
-    def actor_loss(self, batch: Batch, cloning: float) -> tuple[Tensor, Info]:
+    def actor_loss(self, batch: Batch, noise: Tensor, cloning: float) -> tuple[Tensor, Info]:
         """Return E [alpha log pi - min Q] plus the cloning term.
 
         Demonstrated actions are cloned as they are, the policy's own only where they are worth
         more than what it would do now (Nair et al. 2018, "Q-filter").
+
+        Args:
+            batch: of transitions.
+            noise: (B, A) standard normal, for the sampled actions.
+            cloning: weight of the cloning term.
         """
-        action, log_prob, mean = self.actor.sample(batch.observation, batch.goal)
-        value = self.critic(batch.observation, batch.goal, action).amin(0)
+        seen = self.features(batch.observation, batch.goal)
+        action, log_prob, mean = self.actor.sample(seen, noise)
+        value = self.critic(seen, action).amin(0)
         loss = (self.config.alpha * log_prob - value).mean()
         info = {"actor_loss": loss.detach(), "entropy": -log_prob.detach().mean()}
         if cloning:
             chosen = batch.clone
             if not batch.demonstrated.all():
                 with torch.no_grad():
-                    shown = self.critic(batch.observation, batch.goal, batch.action).amin(0)
+                    shown = self.critic(seen, batch.action).amin(0)
                 chosen = chosen * torch.maximum(batch.demonstrated, (shown > value).float())
             error = (mean - batch.action).square().sum(-1)
             clone = (chosen * error).sum() / chosen.sum().clamp(min=1.0)
@@ -167,32 +181,3 @@ class Sac(nn.Module):
             targets: list[Tensor] = list(self.target.body.parameters())
             sources: list[Tensor] = list(self.critic.body.parameters())
             torch._foreach_lerp_(targets, sources, self.config.tau)
-
-
-class SacOptimizer:
-    """One update after another."""
-
-    def __init__(self, sac: Sac, lr: float) -> None:
-        self.sac = sac
-        self.actor = torch.optim.Adam(sac.actor.parameters(), lr=lr, fused=True)
-        self.critic = torch.optim.Adam(sac.critic.parameters(), lr=lr, fused=True)
-
-    def set_lr(self, lr: float) -> None:
-        """Change the learning rate of actor and critics."""
-        for optimizer in (self.actor, self.critic):
-            optimizer.param_groups[0]["lr"] = lr
-
-    def update(self, batch: Batch, cloning: float) -> Info:
-        """Update critics, actor and target on one batch."""
-        loss, critic_info = self.sac.critic_loss(batch)
-        self.critic.zero_grad(set_to_none=True)
-        loss.backward()
-        self.critic.step()
-        self.sac.critic.requires_grad_(False)
-        loss, actor_info = self.sac.actor_loss(batch, cloning)
-        self.actor.zero_grad(set_to_none=True)
-        loss.backward()
-        self.actor.step()
-        self.sac.critic.requires_grad_(True)
-        self.sac.follow()
-        return critic_info | actor_info

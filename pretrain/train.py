@@ -21,8 +21,8 @@ from pretrain.checks import check_pretrain
 from pretrain.config import PretrainConfig
 from pretrain.device import describe, set_up
 from pretrain.layout import Layout
+from pretrain.learner import Learner
 from pretrain.replay import Trajectories
-from pretrain.sac import SacOptimizer
 
 _VALIDATION_SAMPLES = 4096
 _NEAR_M = 0.05
@@ -34,19 +34,17 @@ def pretrain(config: PretrainConfig) -> Path:
     check_pretrain(config)
     resumed = has_progress(run, config.resume, "pretrain.yaml")
     device = set_up(config.device, config.threads)
-    print(describe(device), flush=True)
+    print(describe(device, config.threads), flush=True)
     train, held_out, layout = load_trajectories(config)
     torch.manual_seed(config.seed)
     rng = np.random.default_rng(config.seed)
     bank = train.achieved_goal[rng.integers(len(train), size=BANK)]
     agent = Agent(config.agent, layout, train.moments(), torch.from_numpy(bank)).to(device)
     begin_run(run, config, "pretrain.yaml")
-    sac = SacOptimizer(agent.sac, config.agent.sac.lr)
-    generator = torch.optim.Adam(agent.proposer.parameters(), lr=config.generator_lr, fused=True)
-    optimizers = {"actor": sac.actor, "critic": sac.critic, "generator": generator}
+    learner = Learner(agent, config.agent.sac.lr, config.generator_lr, config.threads)
     done, best, best_state, spent = 0, -np.inf, {}, 0.0
     if resumed:
-        done, numbers, arrays = checkpoint.restore(run, agent, optimizers, rng)
+        done, numbers, arrays = checkpoint.restore(run, agent, learner.optimizers, rng)
         best, spent = numbers["best"], numbers["wall_s"]
         best_state = {name: torch.from_numpy(value) for name, value in arrays.items()}
     log = MetricsLog(run, "pretrain", done)
@@ -55,12 +53,14 @@ def pretrain(config: PretrainConfig) -> Path:
     steps = range(done + 1, config.updates + 1)
     for update in tqdm(steps, "pretraining", config.updates, initial=done, mininterval=1.0):
         remaining = 1.0 - update / config.updates
-        sac.set_lr(config.agent.sac.lr * max(0.1, remaining))
-        generator.param_groups[0]["lr"] = config.generator_lr * max(0.01, remaining)
+        learner.set_lr(
+            config.agent.sac.lr * max(0.1, remaining), config.generator_lr * max(0.01, remaining)
+        )
         batch = train.transitions(config.batch_size, config.agent.mix, rng)
-        info |= sac.update(batch.to(device), config.agent.sac.cloning)
+        hindsight = None
         if update % config.generator_every == 0:
-            info |= update_generator(agent, generator, train, config.generator_batch_size, rng)
+            hindsight = train.subgoals(config.generator_batch_size, config.agent.mix, rng)
+        info |= learner.update(batch, config.agent.sac.cloning, hindsight)
         if update % config.validate_every == 0 or update == config.updates:
             held = validate(agent, held_out, device)
             if float(held["log_likelihood"]) > best:
@@ -77,31 +77,13 @@ def pretrain(config: PretrainConfig) -> Path:
                 run,
                 update,
                 agent,
-                optimizers,
+                learner.optimizers,
                 rng,
                 {"best": best, "wall_s": spent},
                 {name: value.cpu().numpy() for name, value in best_state.items()},
             )
     log.close()
     return run
-
-
-def update_generator(
-    agent: Agent,
-    optimizer: torch.optim.Optimizer,
-    data: Trajectories,
-    count: int,
-    rng: np.random.Generator,
-) -> dict[str, Tensor]:
-    """Update the generator on hindsight subgoals."""
-    device = agent.bank.device
-    sample = (tensor.to(device) for tensor in data.subgoals(count, agent.config.mix, rng))
-    loss, info = agent.proposer.loss(*sample)
-    optimizer.zero_grad(set_to_none=True)
-    loss.backward()
-    torch.nn.utils.clip_grad_norm_(agent.proposer.parameters(), 100.0)
-    optimizer.step()
-    return info
 
 
 @torch.no_grad()
