@@ -1,0 +1,117 @@
+"""The VQ-VAE of image tasks (van den Oord et al. 2017), in the sizes of the paper's appendix.
+
+Encoder: three convolutions of 4 x 4 with stride 2, the last with as many channels as a code has
+components, so that a 3 x 48 x 48 image becomes a 3 x 6 x 6 latent: 36 codes of 3 components. The
+decoder mirrors it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+
+import torch
+from torch import Tensor, nn
+
+from eisp_data.config import to_plain
+from vqvae.codebook import Codebook
+from vqvae.config import VqVaeConfig
+
+STRIDE = 8
+"""Pixels of an image along each side of a code."""
+_LEAST_STD = 1e-3
+
+
+class VqVae(nn.Module):
+    """Images to codes and back."""
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, config: VqVaeConfig) -> None:
+        super().__init__()
+        self.config = config
+        first, second = config.channels
+        depth = config.latent_channels
+        shape = {"kernel_size": 4, "stride": 2, "padding": 1}
+        self.encoder = nn.Sequential(
+            nn.Conv2d(3, first, **shape),
+            nn.ReLU(),
+            nn.Conv2d(first, second, **shape),
+            nn.ReLU(),
+            nn.Conv2d(second, depth, **shape),
+        )
+        self.codebook = Codebook(config.codes, depth, config.decay, config.revive_after)
+        self.decoder = nn.Sequential(
+            nn.ConvTranspose2d(depth, second, **shape),
+            nn.ReLU(),
+            nn.ConvTranspose2d(second, first, **shape),
+            nn.ReLU(),
+            nn.ConvTranspose2d(first, 3, **shape),
+        )
+        self.register_buffer("mean", torch.zeros(3, 1, 1))
+        self.register_buffer("std", torch.ones(3, 1, 1))
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Rows and columns of codes."""
+        height, width = self.config.image_size
+        return height // STRIDE, width // STRIDE
+
+    @property
+    def latent_dim(self) -> int:
+        """Components of an image's latent: 108 for the paper's 3 x 6 x 6."""
+        rows, columns = self.grid
+        return self.config.latent_channels * rows * columns
+
+    def standardise(self, images: Tensor) -> Tensor:
+        """Return (B, H, W, 3) uint8 RGB images as the networks see them, (B, 3, H, W) float32."""
+        return (images.permute(0, 3, 1, 2).float() / 255.0 - self.mean) / self.std
+
+    def picture(self, decoded: Tensor) -> Tensor:
+        """Return the decoder's (B, 3, H, W) as (B, H, W, 3) uint8 RGB."""
+        pixels = (decoded.float() * self.std + self.mean).clamp(0.0, 1.0) * 255.0
+        return pixels.round().to(torch.uint8).permute(0, 2, 3, 1)
+
+    def vectors(self, images: Tensor) -> Tensor:
+        """Return the encoder's (B * cells, D) vectors of standardised images, cell after cell."""
+        return self.encoder(images).float().permute(0, 2, 3, 1).flatten(0, 2)
+
+    def decode_cells(self, cells: Tensor) -> Tensor:
+        """Return the decoder's (B, 3, H, W) for (B * cells, D) codes."""
+        rows, columns = self.grid
+        latent = cells.unflatten(0, (-1, rows, columns)).permute(0, 3, 1, 2)
+        return self.decoder(latent)
+
+    @torch.no_grad()
+    def encode(self, images: Tensor) -> Tensor:
+        """Return the indices (B, cells) of the codes of (B, H, W, 3) uint8 images."""
+        rows, columns = self.grid
+        index = self.codebook.nearest(self.vectors(self.standardise(images)))
+        return index.view(len(images), rows * columns)
+
+    def embed(self, index: Tensor) -> Tensor:
+        """Return the latents (B, latent_dim) of (B, cells) indices, cell after cell."""
+        return self.codebook.code[index].flatten(1)
+
+    @torch.no_grad()
+    def decode(self, latent: Tensor) -> Tensor:
+        """Return the (B, H, W, 3) uint8 images of (B, latent_dim) latents.
+
+        Each cell is first put onto the code nearest to it, which leaves a latent of ``embed`` as
+        it is and makes a picture of one that a generator proposed.
+        """
+        cells = latent.view(-1, self.config.latent_channels)
+        return self.picture(self.decode_cells(self.codebook.code[self.codebook.nearest(cells)]))
+
+    def fingerprint(self) -> str:
+        """Return a key of the weights: what was encoded by another model is of another key."""
+        digest = hashlib.sha256(json.dumps(to_plain(self.config)).encode())
+        for name, tensor in sorted(self.state_dict().items()):
+            digest.update(name.encode() + tensor.cpu().contiguous().numpy().tobytes())
+        return digest.hexdigest()[:16]
+
+    def set_moments(self, mean: Tensor, std: Tensor) -> None:
+        """Set what images are standardised with: (3,) mean and deviation of pixels in 0..1."""
+        self.mean.copy_(mean.view(3, 1, 1))
+        self.std.copy_(std.clamp(min=_LEAST_STD).view(3, 1, 1))

@@ -1,0 +1,191 @@
+"""Training of a VQ-VAE on the camera images of a dataset."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from eisp_data.errors import ConfigError, DataError
+from eisp_data.runs import checkpoint
+from eisp_data.runs.folder import begin_run, has_progress
+from eisp_data.runs.metrics import MetricsLog
+from eisp_data.storage.cache import load_arrays, load_images
+from eisp_data.storage.reader import read_spec
+from vqvae import saved
+from vqvae.config import VqVaeTrainConfig
+from vqvae.losses import loss
+from vqvae.model import STRIDE, VqVae
+from vqvae.quality import Quality, measure
+
+CONFIG_FILE = "vqvae.yaml"
+_VALIDATION_IMAGES = 2048
+_MOMENT_IMAGES = 4096
+
+
+def train(config: VqVaeTrainConfig) -> tuple[Path, Quality]:
+    """Train a VQ-VAE; return the folder of the run and the quality on held-out episodes."""
+    run = config.output_dir
+    check(config)
+    resumed = has_progress(run, config.resume, CONFIG_FILE)
+    device = _set_up(config)
+    images, train_rows, held_rows = load_frames(config)
+    torch.manual_seed(config.seed)
+    rng = np.random.default_rng(config.seed)
+    model = VqVae(config.model)
+    model.set_moments(*moments(images[spread(train_rows, _MOMENT_IMAGES)]))
+    model.to(device, memory_format=torch.channels_last)
+    optimizer = torch.optim.Adam(model.parameters(), lr=config.lr, fused=True)
+    begin_run(run, config, CONFIG_FILE)
+    task = read_spec(config.dataset.root).task
+    done, spent = 0, 0.0
+    if resumed:
+        folder = run / "checkpoints" / "last" / checkpoint.MODEL
+        model.load_state_dict(saved.load(folder)[0].state_dict())
+        done, numbers, _ = checkpoint.restore(run, {"adam": optimizer}, rng)
+        spent = numbers["wall_s"]
+    log = MetricsLog(run, "vqvae", done)
+    start = time.monotonic() - spent
+    held = images[spread(held_rows, _VALIDATION_IMAGES)]
+    quality, revived = measure(model, held) if done == config.updates else None, 0
+    steps = range(done + 1, config.updates + 1)
+    bar = tqdm(steps, "vqvae", config.updates, initial=done, mininterval=1.0)
+    for update in bar:
+        optimizer.param_groups[0]["lr"] = learning_rate(config, update)
+        # Sorted, for the images are mapped from a file.
+        rows = np.sort(train_rows[rng.integers(len(train_rows), size=config.batch_size)])
+        info, fresh = step(model, optimizer, torch.from_numpy(images[rows]), device, config.fast)
+        revived += fresh
+        if update % config.validate_every == 0 or update == config.updates:
+            quality = measure(model, held)
+            bar.set_postfix(psnr=quality.psnr_db, used=quality.used)
+            spent = time.monotonic() - start
+            values: dict[str, float | Tensor] = {f"train/{k}": v for k, v in info.items()}
+            values |= {f"held_out/{k}": v for k, v in asdict(quality).items()}
+            log.write(update, 0, spent, values | {"train/revived": revived})
+            checkpoint.save(
+                run,
+                update,
+                lambda folder: saved.save(model, task, config.dataset.camera, folder),
+                {"adam": optimizer},
+                rng,
+                {"wall_s": spent},
+                {},
+            )
+            revived = 0
+    log.close()
+    assert quality is not None
+    return run, quality
+
+
+def step(
+    model: VqVae, optimizer: torch.optim.Optimizer, images: Tensor, device: str, fast: bool
+) -> tuple[dict[str, Tensor], int]:
+    """Update the model on (B, H, W, 3) images; return the losses and how many codes revived."""
+    total, info, assigned = loss(model, images.to(device), fast=fast)
+    optimizer.zero_grad(set_to_none=True)
+    total.backward()
+    optimizer.step()
+    return info, model.codebook.follow(*assigned)
+
+
+def learning_rate(config: VqVaeTrainConfig, update: int) -> float:
+    """Return the learning rate of an update: half a cosine down to the final share."""
+    falling = 0.5 * (1.0 + math.cos(math.pi * update / config.updates))
+    return config.lr * (config.final_lr_share + (1.0 - config.final_lr_share) * falling)
+
+
+def check(config: VqVaeTrainConfig) -> None:
+    """Raise ConfigError, naming the option, unless the settings can be used."""
+    model = config.model
+    least = {
+        "--updates": config.updates,
+        "--batch-size": config.batch_size,
+        "--validate-every": config.validate_every,
+        "--threads": config.threads,
+        "--model.latent-channels": model.latent_channels,
+        "--model.codes": model.codes,
+        "--model.revive-after": model.revive_after,
+    }
+    for flag, value in least.items():
+        if value < 1:
+            raise ConfigError(f"{flag} must be at least 1; got {value}")
+    if config.seed < 0:
+        raise ConfigError(f"--seed must be at least 0; got {config.seed}")
+    for flag, share in (
+        ("--validation-share", config.validation_share),
+        ("--model.decay", model.decay),
+    ):
+        if not 0 < share < 1:
+            raise ConfigError(f"{flag} must be between 0 and 1; got {share}")
+    if any(size < STRIDE or size % STRIDE for size in model.image_size):
+        said = " x ".join(map(str, model.image_size))
+        raise ConfigError(f"--model.image-size must be multiples of {STRIDE}; got {said}")
+
+
+def load_frames(config: VqVaeTrainConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a dataset's images (R, H, W, 3), mapped, and the rows to learn from and held out.
+
+    Raises:
+        DataError: no such dataset or camera, images of another size, or too few episodes.
+    """
+    root, camera = config.dataset.root, config.dataset.camera
+    check_images(root, camera, config.model.image_size)
+    images, arrays = load_images(root, camera), load_arrays(root)
+    held, rest = split(arrays.num_episodes, config.validation_share, config.seed)
+    if not len(rest):
+        raise DataError(f"{root} has too few episodes: {arrays.num_episodes}")
+    starts, stops = arrays.episode_start[:-1], arrays.episode_start[1:]
+
+    def rows(episodes: np.ndarray) -> np.ndarray:
+        return np.concatenate([np.arange(starts[e], stops[e]) for e in episodes])
+
+    return images, rows(rest), rows(held)
+
+
+def check_images(root: Path, camera: str, size: tuple[int, int]) -> None:
+    """Raise DataError unless the dataset has images of this camera in this (height, width)."""
+    spec = read_spec(root)
+    if camera not in spec.cameras:
+        known = ", ".join(spec.cameras) or "none"
+        raise DataError(
+            f"{root}: no images of camera {camera!r}, its cameras are: {known}; "
+            f"add them with eisp-data render {root} --cameras {camera} --to FOLDER"
+        )
+    if spec.cameras[camera] != size:
+        (height, width), (wanted_height, wanted_width) = spec.cameras[camera], size
+        raise DataError(
+            f"{root}: images of camera {camera!r} are {height} x {width}; "
+            f"the VQ-VAE takes {wanted_height} x {wanted_width}"
+        )
+
+
+def split(episodes: int, share: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the numbers of the episodes that are held out, and of the others, each in order."""
+    order = np.random.default_rng(seed).permutation(episodes)
+    held = max(1, round(share * episodes))
+    return np.sort(order[:held]), np.sort(order[held:])
+
+
+def spread(rows: np.ndarray, count: int) -> np.ndarray:
+    """Return at most ``count`` of the rows, evenly spread."""
+    return rows[np.unique(np.linspace(0, len(rows) - 1, min(count, len(rows))).astype(np.int64))]
+
+
+def moments(images: np.ndarray) -> tuple[Tensor, Tensor]:
+    """Return mean and deviation (3,) of the pixels of (N, H, W, 3) uint8 images, in 0..1."""
+    pixels = images.reshape(-1, 3).astype(np.float32) / 255.0
+    return torch.from_numpy(pixels.mean(0)), torch.from_numpy(pixels.std(0))
+
+
+def _set_up(config: VqVaeTrainConfig) -> str:
+    if config.device == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("--device cuda: this torch sees no CUDA device; choose auto or cpu")
+    torch.set_num_threads(config.threads)
+    return "cuda" if config.device != "cpu" and torch.cuda.is_available() else "cpu"
