@@ -21,14 +21,19 @@ class OnlineConfig:
     batch_size: int = 256
     offline_share: float = 0.5
     """Share of each batch that comes from the dataset."""
+    pursued: float = 0.5
+    """Share of the other goals that are the subgoals that were pursued, met or not: where the
+    policy fails is learned from these alone."""
     lr: float = 1.5e-4
-    """Of SAC; near the one that pretraining ends with, or what it settled is stirred up again."""
+    """Of SAC at the start; near the one that pretraining ends with, or what it settled is stirred
+    up again. It falls linearly to a tenth."""
     cloning: float = 20.0
     """Weight of cloning the actions that led to the goal."""
     generator_every: int = 4
     """Updates of SAC for one of the generator; 0 leaves the generator as it is."""
     generator_batch_size: int = 256
     generator_lr: float = 3e-4
+    """At the start; it falls with the other."""
     replay_size: int = 1_000_000
     """Rows kept of the worlds' trajectories (Table I: D)."""
     evaluate_every: int = 5

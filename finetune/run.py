@@ -91,8 +91,9 @@ def _check(config: FinetuneConfig) -> None:
         },
     )
     at_least(online.round_steps + 1, {"--online.replay-size": online.replay_size})
-    if not 0 <= online.offline_share <= 1:
-        raise ConfigError(f"--online.offline-share must be 0 to 1; got {online.offline_share}")
+    for name, share in (("offline-share", online.offline_share), ("pursued", online.pursued)):
+        if not 0 <= share <= 1:
+            raise ConfigError(f"--online.{name} must be 0 to 1; got {share}")
     check_subgoals(config.subgoals, "--subgoals")
 
 
@@ -151,6 +152,7 @@ def _from_nothing(env_id: str, seed: int) -> tuple[Agent, Trajectories]:
         np.concatenate([episode.observation for episode in episodes]),
         np.concatenate([episode.achieved_goal for episode in episodes]),
         np.concatenate([np.pad(episode.action, ((0, 1), (0, 0))) for episode in episodes]),
+        np.concatenate([np.tile(e.desired_goal, (len(e) + 1, 1)) for e in episodes]),
         np.cumsum([0, *(len(episode) + 1 for episode in episodes)]),
     )
     drawn = np.random.default_rng(seed).integers(len(data), size=BANK)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +25,7 @@ from finetune.evaluate import Evaluation, evaluate
 from finetune.rollout import SubgoalPolicy
 from pretrain import checkpoint
 from pretrain.agent import Agent
+from pretrain.config import GoalMix
 from pretrain.learner import Learner
 from pretrain.replay import Trajectories
 from pretrain.sac import Batch
@@ -58,23 +59,29 @@ class Rollouts:
         """Step all worlds, exploring; then start anew those that are over or solved for good.
 
         Returns:
-            Observations, achieved goals and actions (R, ...), world after world, and the (N + 1,)
-            starts of the worlds' trajectories: each steps + 1 rows, less where a world ended.
+            Observations, achieved goals, actions and pursued subgoals (R, ...), world after world,
+            and the (N + 1,) starts of the worlds' trajectories: each steps + 1 rows, less where a
+            world ended.
         """
         worlds = self.worlds
-        rows: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        rows: list[tuple[np.ndarray, ...]] = []
         lengths = np.ones(worlds.count, np.int64)
         for _ in range(steps):
             observation, achieved = worlds.observation, worlds.achieved_goal
             action = self.policy.act(observation, achieved, worlds.desired_goal, explore=True)
-            rows.append((observation, achieved, action))
+            rows.append((observation, achieved, action, self.policy.subgoal.copy()))
             lengths += ~(worlds.done | worlds.truncated)
             worlds.step(action)
-        last = worlds.observation, worlds.achieved_goal, np.zeros_like(action)
+        last = (
+            worlds.observation,
+            worlds.achieved_goal,
+            np.zeros_like(action),
+            self.policy.subgoal.copy(),
+        )
         lived = np.arange(steps + 1) < lengths[:, None]
         columns = [np.stack(column, 1)[lived] for column in zip(*rows, last, strict=True)]
         # A success that lasted for a round is learned; one that is new has still to be kept.
-        over = worlds.truncated | worlds.done | (self.solved & worlds.success)
+        over = worlds.truncated | worlds.done | worlds.hopeless | (self.solved & worlds.success)
         self.solved = worlds.success
         self.start(np.flatnonzero(over))
         return *columns, np.concatenate([[0], np.cumsum(lengths)])
@@ -125,7 +132,8 @@ class Finetuner:
         threads: int,
     ) -> None:
         self.run, self.agent, self.config = run, agent, config
-        self._mix, self._device = agent.config.mix, device
+        self._offline_mix, self._device = agent.config.mix, device
+        self._mix = _with_pursued(agent.config.mix, config.pursued)
         self._rng = np.random.default_rng(seed)
         torch.manual_seed(seed)
         self._offline = offline
@@ -175,11 +183,13 @@ class Finetuner:
     def _learn(self) -> dict[str, Tensor]:
         config = self.config
         info: dict[str, Tensor] = {}
+        remaining = max(0.1, 1.0 - self._round / config.rounds)
+        self._learner.set_lr(config.lr * remaining, config.generator_lr * remaining)
         offline = round(config.offline_share * config.batch_size) if len(self._offline) else 0
         for update in range(1, config.updates + 1):
             parts = [self._online.transitions(config.batch_size - offline, self._mix, self._rng)]
             if offline:
-                parts.append(self._offline.transitions(offline, self._mix, self._rng))
+                parts.append(self._offline.transitions(offline, self._offline_mix, self._rng))
             hindsight = None
             if config.generator_every and update % config.generator_every == 0:
                 source = self._offline
@@ -223,6 +233,7 @@ class Finetuner:
             "online/observation": online.observation,
             "online/achieved_goal": online.achieved_goal,
             "online/action": online.action,
+            "online/pursued": online.pursued,
             "online/episode_start": online.episode_start,
         }
         numbers = {"curve": self._curve, "wall_s": self._spent}
@@ -235,9 +246,21 @@ class Finetuner:
             self.run, self.agent, self._learner.optimizers, self._rng
         )
         self._curve, self._spent = numbers["curve"], numbers["wall_s"]
-        names = ("observation", "achieved_goal", "action", "episode_start")
+        names = ("observation", "achieved_goal", "action", "pursued", "episode_start")
         self._online.extend(*(arrays[f"online/{name}"] for name in names))
         self._rollouts.restore(arrays)
+
+
+def _with_pursued(mix: GoalMix, share: float) -> GoalMix:
+    """Return the mix with this share of pursued goals, and as much less of all the others."""
+    rest = 1.0 - share
+    return replace(
+        mix,
+        waypoint=rest * mix.waypoint,
+        future=rest * mix.future,
+        displaced=rest * mix.displaced,
+        pursued=share,
+    )
 
 
 def summarise(curve: list[dict[str, float]]) -> dict[str, float]:

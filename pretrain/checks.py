@@ -53,10 +53,10 @@ def check_subgoals(config: SubgoalConfig, flag: str) -> None:
 
 
 def _check_mix(mix: GoalMix) -> None:
-    shares = mix.waypoint, mix.future, mix.displaced
+    shares = mix.waypoint, mix.future, mix.displaced, mix.pursued
     if min(shares) < 0 or abs(sum(shares) - 1) > _ROUNDING:
         said = ", ".join(map(str, shares))
         raise ConfigError(
-            "--agent.mix: the shares of waypoint, future and displaced goals must add up to 1; "
-            f"got {said}"
+            "--agent.mix: the shares of waypoint, future, displaced and pursued goals must add up "
+            f"to 1; got {said}"
         )

@@ -88,7 +88,9 @@ class GoalMix:
     future: float = 0.3
     """Share of goals achieved a little later in the same trajectory."""
     displaced: float = 0.2
-    """Share of goals that send one object to where it, or its like, lay at another time."""
+    """Share of goals that send one object to where it lay at another time."""
+    pursued: float = 0.0
+    """Share of goals that are those that the trajectory was after, whether it met them or not."""
     horizon: int = 40
     """How many steps later a ``future`` goal may lie."""
     tolerance_m: float = 0.05

@@ -35,6 +35,7 @@ class Trajectories:
         self.observation = np.empty((0, layout.observation_dim), np.float32)
         self.achieved_goal = np.empty((0, layout.goal_dim), np.float32)
         self.action = np.empty((0, layout.action_dim), np.float32)
+        self.pursued = np.empty((0, layout.goal_dim), np.float32)
         self.episode_start = np.zeros(1, np.int64)
         self.waypoints = Waypoints(*(np.empty(0, np.int64) for _ in range(3)))
         self._index()
@@ -47,15 +48,21 @@ class Trajectories:
         observation: np.ndarray,
         achieved_goal: np.ndarray,
         action: np.ndarray,
+        pursued: np.ndarray,
         episode_start: np.ndarray,
     ) -> None:
-        """Append whole episodes: rows (R, ...) and their (E + 1,) starts."""
+        """Append whole episodes: rows (R, ...) and their (E + 1,) starts.
+
+        ``pursued`` are the goals (R, G) that the actions were meant for: the subgoals of a
+        rollout, the final goal of a demonstration.
+        """
         starts = np.concatenate([self.episode_start, len(self) + np.asarray(episode_start[1:])])
         first = int(np.searchsorted(starts, starts[-1] - self._capacity))
         cut = int(starts[first])
         self.observation = np.concatenate([self.observation, observation])[cut:]
         self.achieved_goal = np.concatenate([self.achieved_goal, achieved_goal])[cut:]
         self.action = np.concatenate([self.action, action])[cut:]
+        self.pursued = np.concatenate([self.pursued, pursued])[cut:]
         self.episode_start = starts[first:] - cut
         added = find_waypoints(achieved_goal, np.asarray(episode_start), self._parts)
         self.waypoints = self.waypoints.joined(added).without_first(cut)
@@ -76,7 +83,7 @@ class Trajectories:
 
     def transitions(self, count: int, mix: GoalMix, rng: np.random.Generator) -> Batch:
         """Draw transitions with goals relabelled as the mix says."""
-        kind = rng.choice(3, size=count, p=[mix.waypoint, mix.future, mix.displaced])
+        kind = rng.choice(4, size=count, p=[mix.waypoint, mix.future, mix.displaced, mix.pursued])
         rows = self.acting[rng.integers(len(self.acting), size=count)]
         if len(self._guiding):
             lead = kind == 0
@@ -90,6 +97,7 @@ class Trajectories:
         start, after = self.achieved_goal[rows], self.achieved_goal[rows + 1]
         moved = np.linalg.norm(goal - start, axis=1) > _MOVED_M
         goal += self._jitter(mix, goal.shape, rng)
+        goal[kind == 3] = self.pursued[rows[kind == 3]]
         reached = np.linalg.norm(after - goal, axis=1) <= mix.tolerance_m
         # What a trajectory does while nothing moves yet serves its next move, not this goal.
         at_end = (kind == 0) & (source == self._last[rows])

@@ -149,6 +149,7 @@ def gather(
         arrays.observation[rows],
         arrays.achieved_goal[rows],
         arrays.action[rows],
+        np.repeat(arrays.desired_goal[episodes], stops - starts, axis=0),
         np.concatenate([[0], np.cumsum(stops - starts)]),
     )
     return data

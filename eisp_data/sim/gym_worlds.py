@@ -115,6 +115,11 @@ class GymWorlds:
         return self.success
 
     @property
+    def hopeless(self) -> np.ndarray:
+        """(N,) bool: False; a foreign environment ends such an episode itself."""
+        return np.zeros(self.count, bool)
+
+    @property
     def truncated(self) -> np.ndarray:
         """(N,) bool: the episode has had its L steps."""
         return self.steps >= self.episode_steps

@@ -8,6 +8,9 @@ import numpy as np
 
 from eisp_data.tasks.base import Task, compute_reward, is_success
 
+_FALLEN_M = -0.05
+"""Lower than this nothing lies on the table."""
+
 
 class Worlds:
     """N worlds of one task.
@@ -96,6 +99,11 @@ class Worlds:
     def done(self) -> np.ndarray:
         """(N,) bool: False, for the goal has to hold until the end."""
         return np.zeros(self.count, bool)
+
+    @property
+    def hopeless(self) -> np.ndarray:
+        """(N,) bool: an object has fallen off the table, and nothing brings it back."""
+        return self.achieved_goal.reshape(self.count, -1, 3)[..., 2].min(axis=1) < _FALLEN_M
 
     @property
     def action_dim(self) -> int:

@@ -221,7 +221,10 @@ def rollouts(env_id: str, count: int = 3, source: str = "none") -> Rollouts:
 
 
 def test_collected_rows_are_what_happened():
-    observation, achieved, action, starts = rollouts("PushedLine-v0").collect(5)
+    started = rollouts("PushedLine-v0")
+    goals = np.repeat(started.worlds.desired_goal, 6, axis=0)
+    observation, achieved, action, pursued, starts = started.collect(5)
+    np.testing.assert_array_equal(pursued, goals)
     assert starts.tolist() == [0, 6, 12, 18]
     np.testing.assert_array_equal(observation, achieved)
     for first, stop in zip(starts, starts[1:], strict=False):
@@ -233,7 +236,7 @@ def test_collected_rows_are_what_happened():
 
 def test_a_world_that_ends_early_leaves_no_rows_after_its_end():
     started = rollouts("ShortPushedLine-v0")
-    _, achieved, action, starts = started.collect(10)
+    _, achieved, action, _, starts = started.collect(10)
     assert np.diff(starts).tolist() == [5, 5, 5]
     for first, stop in zip(starts, starts[1:], strict=False):
         moved = np.diff(achieved[first:stop, 0])

@@ -30,6 +30,7 @@ EXACT_M = 1e-6
 WAYPOINT = GoalMix(waypoint=1.0, future=0.0, displaced=0.0, horizon=15, tolerance_m=EXACT_M)
 FUTURE = GoalMix(waypoint=0.0, future=1.0, displaced=0.0, horizon=15, tolerance_m=EXACT_M)
 DISPLACED = GoalMix(waypoint=0.0, future=0.0, displaced=1.0, horizon=15, tolerance_m=EXACT_M)
+PURSUED = GoalMix(waypoint=0.0, future=0.0, displaced=0.0, pursued=1.0, tolerance_m=EXACT_M)
 MIXED = GoalMix(waypoint=0.3, future=0.4, displaced=0.3, horizon=15, tolerance_m=EXACT_M)
 
 
@@ -46,7 +47,9 @@ def trajectories(
     observation = np.stack([rows, episode], 1).astype(np.float32)
     # Objects lie elsewhere in every episode, so that places tell episodes apart.
     achieved = np.concatenate([p + np.float32(2.0 * i) for i, p in enumerate(paths)])
-    data.extend(observation, achieved, rows[:, None] / 1000, starts)
+    # No object ever gets where it is pursued to, a place of each row's own.
+    pursued = np.repeat(100 + rows[:, None], layout.goal_dim, axis=1)
+    data.extend(observation, achieved, rows[:, None] / 1000, pursued, starts)
     return data
 
 
@@ -192,6 +195,19 @@ def test_subgoals_are_the_next_waypoint_and_goals_one_at_or_after_it():
             assert same(allowed, wanted).all(1).any()
 
 
+def test_pursued_goals_are_exactly_those_of_the_row_and_never_cloned():
+    batch, rows, goal = draw(trajectories(), PURSUED)
+    np.testing.assert_array_equal(goal, np.repeat(100.0 + rows[:, None], goal.shape[1], axis=1))
+    assert (batch.reward == -1).all() and (batch.clone == 0).all()
+
+
+def test_a_pursued_goal_that_is_met_is_rewarded():
+    data = trajectories()
+    data.pursued[:-1] = data.achieved_goal[1:]
+    batch, _, _ = draw(data, PURSUED)
+    assert (batch.reward == 0).all()
+
+
 def test_equal_seeds_draw_equal_batches():
     data = trajectories()
     first, again = (draw(data, MIXED, seed=3)[0] for _ in range(2))
@@ -219,7 +235,13 @@ def test_capacity_drops_whole_oldest_episodes_and_no_more(batches, capacity, par
     assert np.diff(data.episode_start).tolist() == lengths[kept[0] :]
     expected = np.concatenate(everything[kept[0] :])
     np.testing.assert_array_equal(data.achieved_goal, expected)
-    assert len(data.observation) == len(data.action) == len(data) == data.episode_start[-1]
+    assert (
+        len(data.observation)
+        == len(data.action)
+        == len(data.pursued)
+        == len(data)
+        == data.episode_start[-1]
+    )
     fresh = find_waypoints(expected, data.episode_start, parts)
     np.testing.assert_array_equal(data.waypoints.row, fresh.row)
     np.testing.assert_array_equal(data.waypoints.following, fresh.following)
