@@ -230,7 +230,7 @@ def _fill(root: Path, spec: DatasetSpec, folder: Path) -> None:
     (folder / "info.json").write_text(json.dumps(info))
 
 
-def _new_map(path: Path, shape: tuple[int, ...], dtype: str) -> np.ndarray:
+def _new_map(path: Path, shape: tuple[int, ...], dtype: str) -> np.memmap:
     """Return a new file of zeros, mapped, with its room on the disk already taken.
 
     Without, the file is a hole, and filling it on a full disk kills the process with SIGBUS.

@@ -88,8 +88,13 @@ def read_sidecars(root: Path, index: EpisodeIndex) -> list[Sidecar]:
     return texts
 
 
-def read_blocks(root: Path, spec: DatasetSpec) -> Iterator[Block]:
+def read_blocks(root: Path, spec: DatasetSpec, finite: bool = True) -> Iterator[Block]:
     """Yield the rows of a dataset file by file, every column checked for shape and NaN.
+
+    Args:
+        root: the dataset.
+        spec: its own.
+        finite: off, NaN is let through.
 
     Raises:
         DataError: a file is missing, cut or damaged, a column is missing, of the wrong type or
@@ -106,13 +111,14 @@ def read_blocks(root: Path, spec: DatasetSpec) -> Iterator[Block]:
             name: column_values(table, name, dtype, width, path)[rows]
             for name, (dtype, width) in kinds.items()
         }
-        for name, values in columns.items():
-            _check_finite(values, name, path, starts - starts[0], first)
         sidecars = _sidecars(table, path, starts, first)
         for number, sidecar in enumerate(sidecars):
             if sidecar.spec.to_json() != spec.to_json():
                 raise DataError(f"{path}: episode {first + number} has another spec")
-        yield Block(path, first, starts - starts[0], columns, sidecars)
+        block = Block(path, first, starts - starts[0], columns, sidecars)
+        if finite:
+            check_finite(block)
+        yield block
 
 
 def read_episodes(root: Path | str, images: bool = False) -> Iterator[Episode]:
@@ -219,14 +225,14 @@ def _sidecars(table: pa.Table, path: Path, starts: np.ndarray, first: int) -> li
     ]
 
 
-def _check_finite(
-    values: np.ndarray, name: str, path: Path, starts: np.ndarray, first: int
-) -> None:
-    if values.dtype.kind != "f" or np.isfinite(values).all():
-        return
-    row = int(np.argwhere(~np.isfinite(as_table(values)))[0][0])
-    episode = int(np.searchsorted(starts, row, side="right")) - 1
-    raise DataError(
-        f"{path}: column {name}: not finite in episode {first + episode}, "
-        f"row {row - int(starts[episode])}"
-    )
+def check_finite(block: Block) -> None:
+    """Raise DataError, naming file, column, episode and row, if a number is not finite."""
+    for name, values in block.columns.items():
+        if values.dtype.kind != "f" or np.isfinite(values).all():
+            continue
+        row = int(np.argwhere(~np.isfinite(as_table(values)))[0][0])
+        offset = int(np.searchsorted(block.starts, row, side="right")) - 1
+        raise DataError(
+            f"{block.path}: column {name}: not finite in episode {block.first_episode + offset}, "
+            f"row {row - int(block.starts[offset])}"
+        )

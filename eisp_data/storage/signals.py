@@ -48,7 +48,7 @@ class Collected:
                 high = np.maximum(high, self.extremes[name][1])
             self.extremes[name] = (low, high)
             if name in self.repeated:
-                self.repeated[name] += int(table.sum())
+                self.repeated[name] += int(np.count_nonzero(table > 0))
         for offset, start in enumerate(block.starts[:-1]):
             rows = slice(int(start), int(block.starts[offset + 1]))
             for name, moves in self._moves.items():

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
+import pytest
 from storage_samples import assert_same, random_episode, spec_of
 
 from eisp_data.errors import EispError
@@ -123,6 +124,22 @@ class TestEachKindOfDamage:
         report = repair(root)
         assert report.episodes == 4 and len(report.lost) == 1
 
+    @pytest.mark.parametrize(
+        ("column", "check"),
+        [("timestamp", "timestamps"), ("frame_index", "row numbers"), ("index", "row numbers")],
+    )
+    def test_rows_that_are_numbered_or_timed_wrong_fail_the_check_of_that_name(
+        self, make_dataset, column, check
+    ):
+        root, _ = make_dataset()
+        path = root / "data/chunk-000/file-001.parquet"
+        table = pq.read_table(path)
+        values = table[column].to_numpy().copy()
+        values[3] += 1
+        table = table.set_column(table.column_names.index(column), column, [values])
+        pq.write_table(table, path)
+        assert failed(root) == {check}
+
     def test_nan_costs_its_episode(self, make_dataset):
         root, _ = make_dataset()
         path = root / "data/chunk-000/file-000.parquet"
@@ -131,7 +148,7 @@ class TestEachKindOfDamage:
         reward[0] = np.nan
         number = table.column_names.index("next.reward")
         pq.write_table(table.set_column(number, "next.reward", [reward]), path)
-        assert "rows" in failed(root)
+        assert failed(root) == {"no NaN"}
         report = repair(root)
         assert report.episodes == 4 and "next.reward is not finite" in report.lost[0]
 
