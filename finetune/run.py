@@ -17,6 +17,7 @@ from eisp_data.errors import ConfigError, DataError
 from eisp_data.sim.gym_worlds import AnyWorlds, GymWorlds
 from eisp_data.sim.worlds import Worlds
 from eisp_data.storage.cache import load_arrays
+from eisp_data.storage.files import write_json
 from eisp_data.tasks.registry import TASKS
 from finetune.config import FinetuneConfig
 from finetune.train import Finetuner
@@ -69,7 +70,7 @@ def finetune(config: FinetuneConfig) -> dict[str, float]:
     if config.policy.path and not resumed:
         _keep_history(config.policy.path, run)
     summary = finetuner(resumed)
-    (run / "summary.json").write_text(json.dumps(summary, indent=2))
+    write_json(run / "summary.json", summary)
     return summary
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import tyro
 
 from eisp_data.errors import DataError
+from eisp_data.storage.files import json_text
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ def info(options: tyro.conf.OmitArgPrefixes[Info]) -> None:
 
     facts = summary(options.path)
     if options.json:
-        print(json.dumps(facts, indent=2, ensure_ascii=False))
+        print(json_text(facts))
         return
     width = max(map(len, facts))
     for name, value in facts.items():
