@@ -10,7 +10,7 @@ import hashlib
 import os
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -18,13 +18,17 @@ from typing import Any, Literal
 
 from eisp_data.errors import ConfigError, DataError
 from eisp_data.storage.card import CITATION, PREVIEW, dataset_card
+from eisp_data.storage.checks import Check
 from eisp_data.storage.files import one_line
+from eisp_data.storage.mcap.check import checks as recording_checks
 from eisp_data.storage.schema import CODEBASE_VERSION
 from eisp_data.storage.validate import validate
 from eisp_data.view import preview_png
 
 Kind = Literal["dataset", "recording", "policy"]
 DATASET_FOLDERS = ("data", "meta", "videos")
+WHOLE = ("whole", "message count")
+"""Checks of a recording that must pass before it is sent."""
 PICKLED = (".pkl", ".pickle", ".pt", ".pth", ".bin", ".ckpt", ".joblib", ".dill", ".npy", ".npz")
 """Endings of files whose loading can run code."""
 
@@ -81,7 +85,7 @@ def plan_push(
     """Return what ``push`` would send, having checked all of it; nothing is sent.
 
     A dataset must pass every check of ``validate``; a card and a preview are made for it. MCAP
-    recordings go to a repository of their own, whose name ends in ``-raw``.
+    recordings must be whole, and go to a repository of their own, whose name ends in ``-raw``.
 
     Raises:
         DataError: a check fails (its name and detail), or a policy holds a pickled file.
@@ -93,15 +97,15 @@ def plan_push(
     if kind == "recording":
         raw = repo_id if repo_id.endswith("-raw") else f"{repo_id}-raw"
         files = [path] if path.is_file() else sorted(path.glob("*.mcap"))
+        for file in files:  # what a recorder dropped is lost anyway: that is no reason to refuse
+            _refuse_failed(file, [check for check in recording_checks(file) if check.name in WHOLE])
         return Plan(raw, "dataset", kind, [Item(file.name, file) for file in files])
     if kind == "policy":
         items = [Item(p.relative_to(path).as_posix(), p) for p in _files(path)]
         for item in items:
             _refuse_pickle(item.path, path / item.path)
         return Plan(repo_id, "model", kind, items)
-    for check in validate(path):
-        if not check.passed:
-            raise DataError(f"{path}: check {check.name!r} fails: {check.detail}; repair it first")
+    _refuse_failed(path, validate(path))
     items = [
         Item(p.relative_to(path).as_posix(), p) for f in DATASET_FOLDERS for p in _files(path / f)
     ]
@@ -211,6 +215,12 @@ def pull(repo_id: str, to: Path, repo_type: str = "dataset", revision: str | Non
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return total
+
+
+def _refuse_failed(path: Path, checks: Sequence[Check]) -> None:
+    for check in checks:
+        if not check.passed:
+            raise DataError(f"{path}: check {check.name!r} fails: {check.detail}; repair it first")
 
 
 def _files(folder: Path) -> list[Path]:

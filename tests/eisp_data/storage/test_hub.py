@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import random
 import sys
 
 import pytest
@@ -12,7 +13,10 @@ from storage_samples import assert_same
 
 from eisp_data import hub
 from eisp_data.errors import ConfigError, DataError
+from eisp_data.storage.cache import load_arrays
 from eisp_data.storage.lerobot import read_episodes
+from eisp_data.storage.mcap import messages
+from eisp_data.storage.mcap.writer import McapWriter
 from eisp_data.storage.validate import validate
 
 REPO = "lab/stack"
@@ -79,18 +83,30 @@ def test_the_card_says_what_one_wants_to_know(make_dataset, server):
     assert server.files("dataset", REPO, "v3.0") == files
 
 
-def test_a_dry_run_lists_every_file_and_needs_no_network(make_dataset, monkeypatch, capsys):
+def run_command(monkeypatch, capsys, *words):
+    """Run ``eisp-data`` and return what it prints."""
     from eisp_data.cli.data import main
 
-    root, _ = make_dataset()
-    monkeypatch.setattr("socket.socket.connect", None)
-    words = ["eisp-data", "push", str(root), "--repo-id", REPO, "--dry-run"]
-    monkeypatch.setattr(sys, "argv", words)
+    monkeypatch.setattr(sys, "argv", ["eisp-data", *map(str, words)])
     main()
-    said = capsys.readouterr().out
-    for path in (*(p.relative_to(root) for p in root.rglob("*.parquet")), "README.md", "tag v3.0"):
-        assert str(path) in said
-    assert ".writer.lock" not in said and ".cache" not in said
+    return capsys.readouterr().out
+
+
+def test_a_dry_run_lists_exactly_what_a_push_sends(make_dataset, server, monkeypatch, capsys):
+    root, _ = make_dataset(cameras=True)
+    load_arrays(root)  # its cache is no part of it
+    push = ("push", root, "--repo-id", REPO)
+    with monkeypatch.context() as patch:
+        patch.setattr("socket.socket.connect", None)
+        said = run_command(patch, capsys, *push, "--dry-run").splitlines()
+    assert not server.repos
+    assert run_command(monkeypatch, capsys, *push).startswith("sent ")
+    sent = server.files("dataset", REPO)
+    listed = {path: int(size) for size, path in (line.split() for line in said[2:-1])}
+    assert listed == {path: len(content) for path, content in sent.items()}
+    total = sum(listed.values())
+    assert said[:2] == ["would send", f"{len(sent)} files, {total} bytes, to the dataset {REPO}"]
+    assert said[-1] == "tag v3.0"
 
 
 def test_a_dataset_that_fails_a_check_is_not_sent(make_dataset, server):
@@ -128,12 +144,17 @@ def test_pushing_again_replaces_files_and_moves_the_tag(make_dataset, server, tm
         assert_same(ours, theirs)
 
 
-def test_recordings_go_to_a_repository_of_their_own(server, tmp_path):
-    (tmp_path / "run.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(300_000))
-    plan = hub.plan_push(tmp_path / "run.mcap", REPO)
-    hub.push(plan)
-    assert set(server.files("dataset", f"{REPO}-raw")) == {"run.mcap"}
+def test_recordings_go_to_a_repository_of_their_own_if_they_are_whole(server, tmp_path):
+    path = tmp_path / "run.mcap"
+    with McapWriter(path) as writer:
+        for k in range(200):
+            writer.log("/noise", messages.image(random.Random(k).randbytes(2000), k), k)
+    hub.push(hub.plan_push(path, REPO))
+    assert server.files("dataset", f"{REPO}-raw") == {"run.mcap": path.read_bytes()}
     assert ("dataset", REPO) not in server.repos
+    (tmp_path / "cut.mcap").write_bytes(path.read_bytes()[:300_000])
+    with pytest.raises(DataError, match=r"cut.mcap: check 'whole' fails: .*; repair it first"):
+        hub.plan_push(tmp_path / "cut.mcap", REPO)
 
 
 def test_a_policy_comes_back_and_one_that_is_pickled_does_not_go(server, tmp_path):
