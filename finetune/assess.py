@@ -5,7 +5,8 @@ from __future__ import annotations
 from eisp_data.errors import ConfigError
 from eisp_data.tasks.registry import TASKS
 from finetune.config import EvaluateConfig
-from finetune.evaluate import Evaluation, evaluate, oracle_return
+from finetune.evaluate import Evaluation, evaluate
+from finetune.oracle import oracle_return
 from finetune.run import load_for_rollouts, make_worlds
 from finetune.video import Film
 from pretrain.checks import at_least, check_subgoals

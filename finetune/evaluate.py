@@ -8,11 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from eisp_data.policies.registry import SCRIPTS
-from eisp_data.policies.script import Noise, ScriptedPolicy
 from eisp_data.sim.gym_worlds import AnyWorlds
-from eisp_data.sim.worlds import Worlds
 from eisp_data.tasks.registry import TASKS
+from finetune.oracle import subgoal_policy
 from finetune.rollout import SubgoalPolicy
 from pretrain.agent import Agent
 
@@ -136,7 +134,7 @@ def _batch(
     watch: Callable[[AnyWorlds, SubgoalPolicy], None] | None,
 ) -> tuple[np.ndarray, ...]:
     worlds.reset(range(seed, seed + worlds.count))
-    policy = SubgoalPolicy(agent, worlds.count, device)
+    policy = subgoal_policy(agent, worlds, device)
     returns = np.zeros(worlds.count)
     some = worlds.success
     for _ in range(worlds.episode_steps):
@@ -150,23 +148,6 @@ def _batch(
             watch(worlds, policy)
     distance = np.linalg.norm(worlds.achieved_goal - policy.subgoal, axis=1)
     return worlds.success, worlds.success & worlds.settled, some, returns, distance
-
-
-def oracle_return(name: str, episodes: int, seed: int) -> float | None:
-    """Return the mean return of the noise-free script on these seeds; None if there is none."""
-    if name not in SCRIPTS:
-        return None
-    task = TASKS[name]
-    worlds = Worlds(task, episodes)
-    worlds.reset(range(seed, seed + episodes))
-    policy = ScriptedPolicy(task, SCRIPTS[name], Noise(), episodes)
-    for world in range(episodes):
-        policy.begin(world, worlds.state, worlds.desired_goal[world], seed + world)
-    total = 0.0
-    for _ in range(worlds.episode_steps):
-        worlds.step(policy.act(worlds.state))
-        total += float((worlds.success - 1.0).sum())
-    return total / episodes
 
 
 def share_interval(hits: np.ndarray) -> Estimate:

@@ -51,9 +51,11 @@ class SubgoalPolicy:
         reached = np.linalg.norm(achieved_goal - self.subgoal, axis=1) <= self._config.reached_m
         renew = np.flatnonzero(reached | (self.age >= self._config.every_steps))
         if len(renew):
-            self.subgoal[renew] = self._choose(
-                observation[renew], achieved_goal[renew], desired_goal[renew]
+            chosen = self._choose(
+                renew, observation[renew], achieved_goal[renew], desired_goal[renew]
             )
+            near = np.linalg.norm(chosen - desired_goal[renew], axis=1) <= self._config.final_m
+            self.subgoal[renew] = np.where(near[:, None], desired_goal[renew], chosen)
             self.age[renew] = 0
         self.age += 1
         action = self._agent.sac.act(
@@ -62,16 +64,19 @@ class SubgoalPolicy:
         return action.cpu().numpy()
 
     def _choose(
-        self, observation: np.ndarray, achieved_goal: np.ndarray, desired_goal: np.ndarray
+        self,
+        renew: np.ndarray,
+        observation: np.ndarray,
+        achieved_goal: np.ndarray,
+        desired_goal: np.ndarray,
     ) -> np.ndarray:
+        """Return a subgoal (n, G) for each of the n worlds named by ``renew``."""
         if self._config.source == "none":
             return desired_goal
         state, goal = self._tensor(observation), self._tensor(desired_goal)
         candidates, likelihood = self._propose(state, goal)
         here = self._tensor(achieved_goal)
-        chosen = select(self._agent, state, here, candidates, likelihood).cpu().numpy()
-        near = np.linalg.norm(chosen - desired_goal, axis=1) <= self._config.final_m
-        return np.where(near[:, None], desired_goal, chosen)
+        return select(self._agent, state, here, candidates, likelihood).cpu().numpy()
 
     def _propose(self, state: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
         count = self._config.candidates

@@ -22,6 +22,7 @@ from eisp_data.runs.metrics import MetricsLog
 from eisp_data.sim.gym_worlds import AnyWorlds
 from finetune.config import OnlineConfig
 from finetune.evaluate import Evaluation, evaluate
+from finetune.oracle import subgoal_policy
 from finetune.rollout import SubgoalPolicy
 from pretrain import checkpoint
 from pretrain.agent import Agent
@@ -147,7 +148,7 @@ class Finetuner:
                 f"--online.round-steps {config.round_steps} must divide the "
                 f"{worlds.episode_steps} steps of an episode"
             )
-        policy = SubgoalPolicy(agent, config.worlds, device)
+        policy = subgoal_policy(agent, worlds, device)
         self._rollouts = Rollouts(
             worlds,
             policy,

@@ -65,8 +65,9 @@ class HybridConfig:
 class SubgoalConfig:
     """When and how subgoals are chosen during a rollout (the paper's Algorithm 1)."""
 
-    source: Literal["generator", "random", "none"] = "generator"
-    """The generator, achieved goals drawn from the dataset, or the final goal alone."""
+    source: Literal["generator", "random", "none", "oracle"] = "generator"
+    """The generator, achieved goals drawn from the dataset, the final goal alone, or what the
+    task's noise-free script would achieve next."""
     candidates: int = 4
     """K"""
     selector: Literal["value", "likely"] = "likely"

@@ -12,7 +12,8 @@ from line_env import STEPS
 from eisp_data.sim.gym_worlds import GymWorlds
 from eisp_data.sim.worlds import Worlds
 from eisp_data.tasks.registry import TASKS
-from finetune.evaluate import evaluate, mean_interval, oracle_return, share_interval
+from finetune.evaluate import evaluate, mean_interval, share_interval
+from finetune.oracle import oracle_return
 from finetune.run import load_for_rollouts
 from pretrain.config import SubgoalConfig
 from pretrain.saved import saved_subgoals

@@ -1,0 +1,84 @@
+"""The oracle's subgoals: the upper bound for a subgoal generator, and the oracle's return."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from eisp_data.errors import ConfigError
+from eisp_data.policies.registry import SCRIPTS
+from eisp_data.policies.script import Noise, ScriptedPolicy
+from eisp_data.sim.gym_worlds import AnyWorlds
+from eisp_data.sim.worlds import Worlds
+from eisp_data.tasks.registry import TASKS
+from finetune.rollout import SubgoalPolicy
+from pretrain.agent import Agent
+from pretrain.hindsight import at_rest
+
+_LOOKAHEAD_STEPS = 80
+"""Longer than any script takes for one move."""
+
+
+class OracleSubgoals(SubgoalPolicy):
+    """Heads for what the noise-free script would have achieved after its next move.
+
+    The script goes on from the simulator's own state in a copy of the world, so that its subgoals
+    are right whatever has happened before.
+    """
+
+    def __init__(self, agent: Agent, worlds: AnyWorlds, device: str) -> None:
+        super().__init__(agent, worlds.count, device)
+        if not isinstance(worlds, Worlds):
+            raise ConfigError(
+                f"--subgoals.source oracle: {worlds.name} has no scripted policy; choose "
+                "generator, random or none"
+            )
+        self._worlds = worlds
+        self._physics = worlds.task.physics()
+
+    def _choose(
+        self,
+        renew: np.ndarray,
+        observation: np.ndarray,
+        achieved_goal: np.ndarray,
+        desired_goal: np.ndarray,
+    ) -> np.ndarray:
+        task, state = self._worlds.task, self._worlds.state[renew]
+        script = ScriptedPolicy(task, SCRIPTS[task.name], Noise(), len(renew))
+        for row, world in enumerate(renew):
+            script.begin(row, state, desired_goal[row], seed=int(world))
+        achieved = [achieved_goal]
+        for _ in range(_LOOKAHEAD_STEPS):
+            state = self._physics.step(state, task.control(state, script.act(state)))
+            achieved.append(task.achieved_goal(state))
+        paths = np.stack(achieved, axis=1)
+        rests = [at_rest(path)[0] for path in paths]
+        return np.stack(
+            [
+                path[rest[0]] if len(rest) else goal
+                for path, rest, goal in zip(paths, rests, desired_goal, strict=True)
+            ]
+        )
+
+
+def subgoal_policy(agent: Agent, worlds: AnyWorlds, device: str) -> SubgoalPolicy:
+    """Return the policy whose subgoals come from where the agent's settings say."""
+    if agent.config.subgoals.source == "oracle":
+        return OracleSubgoals(agent, worlds, device)
+    return SubgoalPolicy(agent, worlds.count, device)
+
+
+def oracle_return(name: str, episodes: int, seed: int) -> float | None:
+    """Return the mean return of the noise-free script on these seeds; None if there is none."""
+    if name not in SCRIPTS:
+        return None
+    task = TASKS[name]
+    worlds = Worlds(task, episodes)
+    worlds.reset(range(seed, seed + episodes))
+    policy = ScriptedPolicy(task, SCRIPTS[name], Noise(), episodes)
+    for world in range(episodes):
+        policy.begin(world, worlds.state, worlds.desired_goal[world], seed + world)
+    total = 0.0
+    for _ in range(worlds.episode_steps):
+        worlds.step(policy.act(worlds.state))
+        total += float((worlds.success - 1.0).sum())
+    return total / episodes
