@@ -42,8 +42,19 @@ class Arm:
     """rad/s^2, of every joint; no URDF has one, so this is our choice."""
     gripper_m: tuple[float, float]
     gripper_speed_m_s: float
+    task_in_base_m: tuple[float, float, float]
+    """Where the task's frame lies, its axes parallel to the base's: a place where the arm reaches
+    the whole workspace. A calibration replaces it."""
+    tool_mass_kg: float
+    effort: tuple[float, ...] = ()
+    """(J,) N m where the URDF does not have the data sheet's."""
     held: Mapping[str, float] = field(default_factory=dict)
     """Other joints of the URDF that are held away from zero, rad or m."""
+
+    @property
+    def transform_task_to_base(self) -> np.ndarray:
+        """(4, 4)."""
+        return cell.transform(np.eye(3), np.array(self.task_in_base_m))
 
     @property
     def urdf_path(self) -> Path:
@@ -56,9 +67,11 @@ _TIAGO_TOOL_LENGTH_M = 0.155
 
 
 def _tiago(side: str) -> Arm:
-    # The tip's x leaves the hand, the tool's z enters it.
+    # The tip's x leaves the hand, the tool's z enters it. Of the two ways round for a gripper whose
+    # fingers are alike, this is the one with which the wrist is in the middle of its range.
+    way = -1.0 if side == "left" else 1.0
     tool = cell.transform(
-        np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),
+        np.array([[0.0, 0.0, -1.0], [0.0, way, 0.0], [way, 0.0, 0.0]]),
         np.array([_TIAGO_TOOL_LENGTH_M, 0.0, 0.0]),
     )
     # The other arm hangs where it cannot be met.
@@ -71,11 +84,13 @@ def _tiago(side: str) -> Arm:
         joint_names=tuple(f"arm_{side}_{i}_joint" for i in range(1, 8)),
         tip_link=f"wrist_{side}_ft_tool_link",
         transform_tool_to_tip=tool,
-        home=(0.0,) * 7,
+        home=(1.01, -0.2, 2.22, 1.86, 0.02, -0.9, -0.35),
         acceleration=6.0,
         gripper_m=(0.0, 0.09),
         gripper_speed_m_s=0.1,
-        held=held | {"torso_lift_joint": 0.2},
+        task_in_base_m=(0.13, 0.22 if side == "left" else -0.22, 0.57),
+        tool_mass_kg=0.8,
+        held=held | {"torso_lift_joint": 0.35},
     )
 
 
@@ -96,9 +111,12 @@ ARMS: dict[str, Arm] = {
             tip_link="tool0",
             transform_tool_to_tip=cell.transform_tool_to_flange(),
             home=cell.HOME_RAD,
-            acceleration=15.0,
+            acceleration=25.0,
             gripper_m=(0.0, 0.085),
             gripper_speed_m_s=0.15,
+            task_in_base_m=tuple(cell.transform_task_to_base()[:3, 3]),
+            tool_mass_kg=0.93,
+            effort=(56.0, 56.0, 28.0, 12.0, 12.0, 12.0),
         ),
         _tiago("left"),
         _tiago("right"),
@@ -124,7 +142,15 @@ def arm_model(name: str) -> pinocchio.Model:
 
     arm = get_arm(name)
     whole = pin.buildModelFromUrdf(str(arm.urdf_path))
-    return pin.buildReducedModel(whole, held_joints(whole, arm), held_posture(whole, arm))
+    model = pin.buildReducedModel(whole, held_joints(whole, arm), held_posture(whole, arm))
+    tip = model.frames[model.getFrameId(arm.tip_link)]
+    middle = pin.SE3(arm.transform_tool_to_tip)
+    middle.translation /= 2
+    tool = pin.Inertia.FromSphere(arm.tool_mass_kg, 0.05)
+    model.appendBodyToJoint(tip.parentJoint, tool, tip.placement * middle)
+    if arm.effort:
+        model.effortLimit = np.array(arm.effort)
+    return model
 
 
 def held_joints(whole: pinocchio.Model, arm: Arm) -> list[int]:

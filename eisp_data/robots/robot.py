@@ -90,7 +90,7 @@ class Robot(ABC):
 
     Attributes:
         name: as in the registry.
-        arm: which kinematics it has, a name in ``kinematics.ARMS``.
+        arm: which kinematics it has, a name in ``arms.ARMS``.
         joint_names: J names, in the order of every array of joints.
         control_hz: the rate at which commands are expected.
         limits: of the joints and the gripper.
