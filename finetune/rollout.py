@@ -28,6 +28,10 @@ class SubgoalPolicy:
         """Forget the subgoals of the named worlds."""
         self.age[worlds] = self._config.every_steps
 
+    def reached(self, achieved_goal: np.ndarray) -> np.ndarray:
+        """Return whether each world is at its subgoal, (N,) bool, of (N, G) achieved goals."""
+        return np.linalg.norm(achieved_goal - self.subgoal, axis=1) <= self._config.reached_m
+
     @torch.no_grad()
     def act(
         self,
@@ -48,8 +52,7 @@ class SubgoalPolicy:
         Returns:
             (N, A) float32 in [-1, 1].
         """
-        reached = np.linalg.norm(achieved_goal - self.subgoal, axis=1) <= self._config.reached_m
-        renew = np.flatnonzero(reached | (self.age >= self._config.every_steps))
+        renew = np.flatnonzero(self.reached(achieved_goal) | (self.age >= self._config.every_steps))
         if len(renew):
             chosen = self._choose(
                 renew, observation[renew], achieved_goal[renew], desired_goal[renew]
