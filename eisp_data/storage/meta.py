@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,7 @@ def info_json(spec: DatasetSpec, episodes: int, frames: int) -> dict[str, Any]:
         "splits": {"train": f"0:{episodes}"},
         "data_path": DATA_PATH,
         "video_path": VIDEO_PATH if spec.cameras else None,
-        "features": features(spec, feature_info(spec.fps)),
+        "features": features(spec, partial(feature_info, spec.fps)),
     }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from eisp_data.storage.spec import DatasetSpec
@@ -57,12 +58,12 @@ def column_widths(spec: DatasetSpec) -> dict[str, tuple[str, int]]:
     return {name: kind for name, kind in columns.items() if kind[1] > 0}
 
 
-def features(spec: DatasetSpec, video_info: dict[str, Any]) -> dict[str, Any]:
+def features(spec: DatasetSpec, video_info: Callable[[int, int], dict[str, Any]]) -> dict[str, Any]:
     """Return the ``features`` table of ``meta/info.json``.
 
     Args:
         spec: the dataset's shapes.
-        video_info: what LeRobot records of a camera's encoding, without its size.
+        video_info: what LeRobot records of the encoding of frames of a height and width.
     """
     table: dict[str, Any] = {}
     for name, (dtype, width) in column_widths(spec).items():
@@ -73,6 +74,6 @@ def features(spec: DatasetSpec, video_info: dict[str, Any]) -> dict[str, Any]:
             "dtype": "video",
             "shape": [height, width, 3],
             "names": ["height", "width", "channels"],
-            "info": {"video.height": height, "video.width": width, **video_info},
+            "info": video_info(height, width),
         }
     return table

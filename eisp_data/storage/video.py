@@ -14,21 +14,32 @@ from eisp_data.errors import DataError
 from eisp_data.storage.files import one_line
 
 CODEC = "h264"
-OPTIONS = {"crf": "23", "preset": "veryfast", "g": "2", "bf": "0"}
+OPTIONS = {"preset": "veryfast", "g": "2", "bf": "0"}
 """A key frame every second frame, as LeRobot does, so that any frame is at most two decodes away;
 no B-frames, so that frames are stored in the order of their rows."""
-PIXEL_FORMAT = "yuv420p"
+_SMALL = 96
+_FINE, _USUAL = ("yuv444p", "8"), ("yuv420p", "23")
+"""Pixel format and constant rate factor of frames up to 96 pixels, and of larger ones. In small
+frames an object is a few pixels: at 48 x 48 the usual came back at 30 dB, half of the colours and
+most edges gone, the fine at 43 dB, for 650 instead of 200 bytes a frame (raw: 6,912)."""
 
 
-def feature_info(fps: int) -> dict[str, Any]:
+def _encoding(height: int, width: int) -> tuple[str, str]:
+    return _FINE if max(height, width) <= _SMALL else _USUAL
+
+
+def feature_info(fps: int, height: int, width: int) -> dict[str, Any]:
     """Return what LeRobot keeps of an encoding in ``info.json``; its tools encode alike from it."""
+    pixel_format, crf = _encoding(height, width)
     return {
+        "video.height": height,
+        "video.width": width,
         "video.codec": CODEC,
-        "video.pix_fmt": PIXEL_FORMAT,
+        "video.pix_fmt": pixel_format,
         "video.fps": fps,
         "video.channels": 3,
         "video.g": int(OPTIONS["g"]),
-        "video.crf": int(OPTIONS["crf"]),
+        "video.crf": int(crf),
         "video.preset": OPTIONS["preset"],
         "video.fast_decode": 0,
         "video.video_backend": "pyav",
@@ -56,11 +67,11 @@ def encode_video(path: Path, frames: Iterable[np.ndarray], fps: int, threads: in
         stream: Any = None
         for count, image in enumerate(frames, start=1):
             if stream is None:
-                stream = container.add_stream(
-                    CODEC, rate=fps, options={**OPTIONS, "threads": str(threads)}
-                )
+                pixel_format, crf = _encoding(*image.shape[:2])
+                options = {**OPTIONS, "crf": crf, "threads": str(threads)}
+                stream = container.add_stream(CODEC, rate=fps, options=options)
                 stream.height, stream.width = image.shape[:2]
-                stream.pix_fmt = PIXEL_FORMAT
+                stream.pix_fmt = pixel_format
                 stream.codec_context.time_base = Fraction(1, fps)
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
             frame.pts, frame.time_base = count - 1, Fraction(1, fps)
