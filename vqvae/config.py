@@ -29,6 +29,17 @@ class VqVaeConfig:
 
 
 @dataclass(frozen=True)
+class VisionConfig:
+    """What an image task sees its worlds with."""
+
+    task: str
+    """The task whose images the VQ-VAE was trained on."""
+    camera: str
+    """Which camera saw them."""
+    model: VqVaeConfig
+
+
+@dataclass(frozen=True)
 class DatasetConfig:
     """A dataset with camera images."""
 

@@ -27,30 +27,24 @@ class VqVae(nn.Module):
 
     mean: Tensor
     std: Tensor
+    unit: Tensor
+    """Factor of latents, set by ``vqvae.calibrate``: 0.05 apart is what 5 cm are elsewhere."""
 
     def __init__(self, config: VqVaeConfig) -> None:
         super().__init__()
         self.config = config
         first, second = config.channels
         depth = config.latent_channels
-        shape = {"kernel_size": 4, "stride": 2, "padding": 1}
         self.encoder = nn.Sequential(
-            nn.Conv2d(3, first, **shape),
-            nn.ReLU(),
-            nn.Conv2d(first, second, **shape),
-            nn.ReLU(),
-            nn.Conv2d(second, depth, **shape),
+            _halve(3, first), nn.ReLU(), _halve(first, second), nn.ReLU(), _halve(second, depth)
         )
         self.codebook = Codebook(config.codes, depth, config.decay, config.revive_after)
         self.decoder = nn.Sequential(
-            nn.ConvTranspose2d(depth, second, **shape),
-            nn.ReLU(),
-            nn.ConvTranspose2d(second, first, **shape),
-            nn.ReLU(),
-            nn.ConvTranspose2d(first, 3, **shape),
+            _double(depth, second), nn.ReLU(), _double(second, first), nn.ReLU(), _double(first, 3)
         )
         self.register_buffer("mean", torch.zeros(3, 1, 1))
         self.register_buffer("std", torch.ones(3, 1, 1))
+        self.register_buffer("unit", torch.ones(()))
 
     @property
     def grid(self) -> tuple[int, int]:
@@ -92,7 +86,7 @@ class VqVae(nn.Module):
 
     def embed(self, index: Tensor) -> Tensor:
         """Return the latents (B, latent_dim) of (B, cells) indices, cell after cell."""
-        return self.codebook.code[index].flatten(1)
+        return (self.codebook.code[index] * self.unit).flatten(1)
 
     @torch.no_grad()
     def decode(self, latent: Tensor) -> Tensor:
@@ -101,7 +95,7 @@ class VqVae(nn.Module):
         Each cell is first put onto the code nearest to it, which leaves a latent of ``embed`` as
         it is and makes a picture of one that a generator proposed.
         """
-        cells = latent.view(-1, self.config.latent_channels)
+        cells = latent.view(-1, self.config.latent_channels) / self.unit
         return self.picture(self.decode_cells(self.codebook.code[self.codebook.nearest(cells)]))
 
     def fingerprint(self) -> str:
@@ -115,3 +109,11 @@ class VqVae(nn.Module):
         """Set what images are standardised with: (3,) mean and deviation of pixels in 0..1."""
         self.mean.copy_(mean.view(3, 1, 1))
         self.std.copy_(std.clamp(min=_LEAST_STD).view(3, 1, 1))
+
+
+def _halve(inputs: int, outputs: int) -> nn.Conv2d:
+    return nn.Conv2d(inputs, outputs, kernel_size=4, stride=2, padding=1)
+
+
+def _double(inputs: int, outputs: int) -> nn.ConvTranspose2d:
+    return nn.ConvTranspose2d(inputs, outputs, kernel_size=4, stride=2, padding=1)

@@ -16,10 +16,11 @@ from eisp_data.errors import ConfigError, DataError
 from eisp_data.runs import checkpoint
 from eisp_data.runs.folder import begin_run, has_progress
 from eisp_data.runs.metrics import MetricsLog
-from eisp_data.storage.cache import load_arrays, load_images
-from eisp_data.storage.reader import read_spec
+from eisp_data.storage.cache import DatasetArrays, load_arrays, load_images
 from vqvae import saved
-from vqvae.config import VqVaeTrainConfig
+from vqvae.calibrate import calibrate
+from vqvae.config import VisionConfig, VqVaeTrainConfig
+from vqvae.latents import check_images, encode
 from vqvae.losses import loss
 from vqvae.model import STRIDE, VqVae
 from vqvae.quality import Quality, measure
@@ -35,15 +36,16 @@ def train(config: VqVaeTrainConfig) -> tuple[Path, Quality]:
     check(config)
     resumed = has_progress(run, config.resume, CONFIG_FILE)
     device = _set_up(config)
-    images, train_rows, held_rows = load_frames(config)
+    images, arrays, episodes, held_episodes = load_frames(config)
+    train_rows, held_rows = rows_of(arrays, episodes), rows_of(arrays, held_episodes)
     torch.manual_seed(config.seed)
     rng = np.random.default_rng(config.seed)
     model = VqVae(config.model)
     model.set_moments(*moments(images[spread(train_rows, _MOMENT_IMAGES)]))
-    model.to(device, memory_format=torch.channels_last)
+    model.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.Adam(model.parameters(), lr=config.lr, fused=True)
     begin_run(run, config, CONFIG_FILE)
-    task = read_spec(config.dataset.root).task
+    vision = VisionConfig(arrays.spec.task, config.dataset.camera, config.model)
     done, spent = 0, 0.0
     if resumed:
         folder = run / "checkpoints" / "last" / checkpoint.MODEL
@@ -64,6 +66,8 @@ def train(config: VqVaeTrainConfig) -> tuple[Path, Quality]:
         revived += fresh
         if update % config.validate_every == 0 or update == config.updates:
             quality = measure(model, held)
+            if update == config.updates:
+                calibrate(model, encode(model, images), arrays, episodes)
             bar.set_postfix(psnr=quality.psnr_db, used=quality.used)
             spent = time.monotonic() - start
             values: dict[str, float | Tensor] = {f"train/{k}": v for k, v in info.items()}
@@ -72,7 +76,7 @@ def train(config: VqVaeTrainConfig) -> tuple[Path, Quality]:
             checkpoint.save(
                 run,
                 update,
-                lambda folder: saved.save(model, task, config.dataset.camera, folder),
+                lambda folder: saved.save(model, vision, folder),
                 {"adam": optimizer},
                 rng,
                 {"wall_s": spent},
@@ -129,8 +133,11 @@ def check(config: VqVaeTrainConfig) -> None:
         raise ConfigError(f"--model.image-size must be multiples of {STRIDE}; got {said}")
 
 
-def load_frames(config: VqVaeTrainConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a dataset's images (R, H, W, 3), mapped, and the rows to learn from and held out.
+def load_frames(
+    config: VqVaeTrainConfig,
+) -> tuple[np.ndarray, DatasetArrays, np.ndarray, np.ndarray]:
+    """Return a dataset's images (R, H, W, 3), mapped, its arrays, and which of its episodes to
+    learn from and which are held out.
 
     Raises:
         DataError: no such dataset or camera, images of another size, or too few episodes.
@@ -141,29 +148,13 @@ def load_frames(config: VqVaeTrainConfig) -> tuple[np.ndarray, np.ndarray, np.nd
     held, rest = split(arrays.num_episodes, config.validation_share, config.seed)
     if not len(rest):
         raise DataError(f"{root} has too few episodes: {arrays.num_episodes}")
-    starts, stops = arrays.episode_start[:-1], arrays.episode_start[1:]
-
-    def rows(episodes: np.ndarray) -> np.ndarray:
-        return np.concatenate([np.arange(starts[e], stops[e]) for e in episodes])
-
-    return images, rows(rest), rows(held)
+    return images, arrays, rest, held
 
 
-def check_images(root: Path, camera: str, size: tuple[int, int]) -> None:
-    """Raise DataError unless the dataset has images of this camera in this (height, width)."""
-    spec = read_spec(root)
-    if camera not in spec.cameras:
-        known = ", ".join(spec.cameras) or "none"
-        raise DataError(
-            f"{root}: no images of camera {camera!r}, its cameras are: {known}; "
-            f"add them with eisp-data render {root} --cameras {camera} --to FOLDER"
-        )
-    if spec.cameras[camera] != size:
-        (height, width), (wanted_height, wanted_width) = spec.cameras[camera], size
-        raise DataError(
-            f"{root}: images of camera {camera!r} are {height} x {width}; "
-            f"the VQ-VAE takes {wanted_height} x {wanted_width}"
-        )
+def rows_of(arrays: DatasetArrays, episodes: np.ndarray) -> np.ndarray:
+    """Return the rows of the named episodes."""
+    starts, stops = arrays.episode_start[episodes], arrays.episode_start[episodes + 1]
+    return np.concatenate([np.arange(a, b) for a, b in zip(starts, stops, strict=True)])
 
 
 def split(episodes: int, share: float, seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -33,9 +33,8 @@ class Worlds:
         """Start the named worlds (all, if left out) anew, each from its own seed."""
         indices = np.arange(self.count) if worlds is None else np.asarray(worlds)
         for index, seed in zip(indices, seeds, strict=True):
-            rng = np.random.default_rng(int(seed))
-            self.state[index], self.desired_goal[index] = self.task.reset(rng)
-        self.steps[indices] = 0
+            state, goal = self.task.reset(np.random.default_rng(int(seed)))
+            self.restore(state[None], goal[None], np.array([index]))
 
     def restore(
         self, state: np.ndarray, desired_goal: np.ndarray, worlds: np.ndarray | None = None
@@ -103,7 +102,8 @@ class Worlds:
     @property
     def hopeless(self) -> np.ndarray:
         """(N,) bool: an object has fallen off the table, and nothing brings it back."""
-        return self.achieved_goal.reshape(self.count, -1, 3)[..., 2].min(axis=1) < _FALLEN_M
+        places = self.task.achieved_goal(self.state).reshape(self.count, -1, 3)
+        return places[..., 2].min(axis=1) < _FALLEN_M
 
     @property
     def action_dim(self) -> int:

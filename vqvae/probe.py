@@ -1,0 +1,116 @@
+"""Where things are, read off the latents by a linear map: what a policy could know of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from eisp_data.storage.cache import DatasetArrays
+
+_RIDGE = 1.0
+_ON_TABLE_M = 0.6
+"""Further from the robot's base than this, or below the table, nothing is in the picture."""
+_MOST_ROWS = 20_000
+_ITERATIONS, _ACCURACY, _TINY = 200, 1e-3, 1e-30
+
+
+@dataclass(frozen=True)
+class Probe:
+    """Mean distances in millimetres between where an object is and where a probe says it is."""
+
+    latent_mm: float
+    """A linear map of the latent, 108 numbers."""
+    codes_mm: float
+    """A linear map of which code each cell has: what a first layer that knows the codes sees."""
+    unknown_mm: float
+    """Without looking: the mean place of all frames."""
+
+
+def probe(
+    latents: np.ndarray,
+    codes: np.ndarray,
+    count: int,
+    arrays: DatasetArrays,
+    names: list[str],
+    rows: np.ndarray,
+    held_rows: np.ndarray,
+) -> dict[str, Probe]:
+    """Fit the probes and return their errors on held-out rows.
+
+    Args:
+        latents: (R, D).
+        codes: (R, cells) indices below ``count``.
+        count: K.
+        arrays: of the dataset; its achieved goal is [x, y, z] of one object after the other.
+        names: of these objects.
+        rows: to fit on.
+        held_rows: to measure on.
+    """
+    places = arrays.achieved_goal.reshape(len(arrays.achieved_goal), -1, 3)
+    found = {}
+    for index, name in enumerate(names):
+        place = np.asarray(places[:, index], np.float64)
+        seen = (np.abs(place).max(1) < _ON_TABLE_M) & (place[:, 2] > 0.0)
+        fit, held = (_thin(part[seen[part]]) for part in (rows, held_rows))
+        truth = place[held] - place[fit].mean(0)
+        centred = place[fit] - place[fit].mean(0)
+        found[name] = Probe(
+            latent_mm=_error(_latent_map(latents, fit, held, centred), truth),
+            codes_mm=_error(_code_map(codes, count, fit, held, centred), truth),
+            unknown_mm=_error(np.zeros_like(truth), truth),
+        )
+    return found
+
+
+def _thin(rows: np.ndarray) -> np.ndarray:
+    return rows[:: -(-len(rows) // _MOST_ROWS)] if len(rows) else rows
+
+
+def _error(guess: np.ndarray, truth: np.ndarray) -> float:
+    return float(np.linalg.norm(guess - truth, axis=1).mean() * 1000.0)
+
+
+def _latent_map(
+    latents: np.ndarray, fit: np.ndarray, held: np.ndarray, target: np.ndarray
+) -> np.ndarray:
+    mean, std = latents[fit].mean(0), latents[fit].std(0)
+    std[std < 1e-6 * std.max()] = 1.0
+    inputs, others = (((latents[part] - mean) / std).astype(float) for part in (fit, held))
+    inputs, others = (
+        np.hstack([x, np.ones((len(x), 1))]).astype(np.float64) for x in (inputs, others)
+    )
+    gram = inputs.T @ inputs + _RIDGE * np.eye(inputs.shape[1])
+    return others @ np.linalg.solve(gram, inputs.T @ target)
+
+
+def _code_map(
+    codes: np.ndarray, count: int, fit: np.ndarray, held: np.ndarray, target: np.ndarray
+) -> np.ndarray:
+    """Ridge regression on cells x K indicators, by conjugate gradients (Hestenes and Stiefel)."""
+    cells = codes.shape[1]
+    offsets = np.arange(cells) * count
+
+    def forward(part: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        return weights[codes[part].astype(np.int64) + offsets].sum(1)
+
+    columns = (codes[fit].astype(np.int64) + offsets).ravel()
+
+    def backward(values: np.ndarray) -> np.ndarray:
+        each = (np.bincount(columns, np.repeat(v, cells), cells * count) for v in values.T)
+        return np.stack(list(each), 1)
+
+    weights = np.zeros((cells * count, target.shape[1]))
+    residual = backward(target)
+    direction, size = residual, (residual**2).sum(0)
+    first = size
+    for _ in range(_ITERATIONS):
+        curved = backward(forward(fit, direction)) + _RIDGE * direction
+        step = size / np.maximum((direction * curved).sum(0), _TINY)
+        weights = weights + step * direction
+        residual = residual - step * curved
+        before, size = size, (residual**2).sum(0)
+        if (size <= _ACCURACY**2 * first).all():
+            break
+        direction = residual + size / np.maximum(before, _TINY) * direction
+    return forward(held, weights)
