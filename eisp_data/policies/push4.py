@@ -27,6 +27,8 @@ _START_M = 0.014
 _BRAKE_M_S2 = 5.0
 """The friction of the table stops a block at 6.9 m/s2: braked harder, it slides on by itself."""
 _BACK_M = 0.012
+_WAIT_STEPS = 25
+"""Before looking anew for something to do, where blocks are jammed."""
 
 
 def push4(view: View, aim: Aim) -> Iterator[Keyframe]:
@@ -39,8 +41,9 @@ def push4(view: View, aim: Aim) -> Iterator[Keyframe]:
     while aim.noise.partial and view.time_s < aim.noise.least_s:
         own = _own_places(view, aim)
         if own is None:
-            break
-        yield from _arrange(view, aim, own, len(own))
+            yield replace(_rise(view), hold_steps=_WAIT_STEPS)
+        else:
+            yield from _arrange(view, aim, own, len(own))
     yield _rise(view)
 
 
