@@ -8,9 +8,9 @@ import numpy as np
 from eisp_data.robots.markers import RIM_M, MarkedObject, Marker, dictionary
 
 _PIXELS_PER_M = 4000.0
-_EDGE_M = 0.0015
-"""Outermost line of the rim, in the colour of what the sticker is on."""
-_ABOVE_M = 0.0002
+_TINT = 0.35
+"""Of the colour of what the sticker is on, in its rim."""
+_ABOVE_M = 0.00003
 """Between the sticker and its body, or the two would flicker."""
 _WHITE = np.array([0.93, 0.93, 0.93])
 _INK = 0.06
@@ -26,7 +26,7 @@ def stick(
         spec: the scene.
         body: whose frame is the object's.
         item: the markers.
-        colour: (3,) RGB of the edge, 0 to 1.
+        colour: (3,) RGB, 0 to 1, of which the rim has a tint.
     """
     for marker in item.markers:
         image = marker_picture(marker, colour)
@@ -62,11 +62,10 @@ def marker_picture(marker: Marker, colour: np.ndarray) -> np.ndarray:
     """Return the marker with its rim, (H, H, 3) uint8, as one reads it."""
     import cv2
 
-    code, rim, edge = (round(x * _PIXELS_PER_M) for x in (marker.size_m, RIM_M, _EDGE_M))
+    code, rim = round(_PIXELS_PER_M * marker.size_m), round(_PIXELS_PER_M * RIM_M)
     bits = cv2.aruco.generateImageMarker(dictionary(), marker.number, code, borderBits=1) / 255.0
     image = np.empty((code + 2 * rim,) * 2 + (3,))
-    image[:] = colour
-    image[edge:-edge, edge:-edge] = _WHITE
+    image[:] = (1 - _TINT) * _WHITE + _TINT * colour
     image[rim:-rim, rim:-rim] = _INK + (_WHITE - _INK) * bits[..., None]
     return np.round(255.0 * image).astype(np.uint8)
 

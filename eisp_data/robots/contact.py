@@ -1,0 +1,89 @@
+"""What fingers do to a block that they touch: it moves as far as it has to, in their direction.
+
+Blocks are slow and slide with friction, so a pushed one stays where it is left. This tells where a
+block is that the camera cannot see, and where one is now that it saw a moment ago.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from eisp_data.sim.drawer import BAR_HALF_M, HANDLE_CLOSED_M, HANDLE_GAP_M, TRAVEL_M
+from eisp_data.sim.scene import BLOCK_SIZE_M
+
+_HALF = BLOCK_SIZE_M / 2
+_FINGER_HALF_M = (0.011, 0.006)
+"""Half the size of a finger along and across the hand (see ``eisp_data.sim.scene``)."""
+_FINGER_BELOW_M, _FINGER_ABOVE_M = 0.014, 0.051
+_STILL_M = 1e-6
+_BAR_HALF_WIDTH_M, _BAR_TOP_M = 0.045, 0.044
+
+
+def push_out(block: np.ndarray, tool: np.ndarray, opening_m: float, way: np.ndarray) -> np.ndarray:
+    """Return the block's (4, 4) pose after the fingers have come where they are.
+
+    Args:
+        block: (4, 4) to the task, upright.
+        tool: (4, 4) to the task.
+        opening_m: between the fingertips.
+        way: (3,) m, how the tool has moved to get here.
+    """
+    length = float(np.linalg.norm(way[:2]))
+    height = block[2, 3] - tool[2, 3]
+    apart = not -_FINGER_BELOW_M - _HALF < height < _FINGER_ABOVE_M + _HALF
+    if length < _STILL_M or apart:
+        return block
+    direction = way[:2] / length
+    shift = max(
+        _overlap_along(block, tool, side * (opening_m / 2 + _FINGER_HALF_M[1]), direction)
+        for side in (-1, 1)
+    )
+    moved = block.copy()
+    # Fingers push no further than they have come.
+    moved[:2, 3] += min(shift, length) * direction
+    return moved
+
+
+def _overlap_along(
+    block: np.ndarray, tool: np.ndarray, offset_m: float, direction: np.ndarray
+) -> float:
+    """Return how far a block has to move along (2,) to be clear of one finger, metres.
+
+    The separating axes of two rectangles are their sides' directions.
+    """
+    hand = _flat(tool[:2, :2].T)
+    finger = tool[:2, 3] + offset_m * hand[1]
+    # An upright cube may stand on any face: its sides' normals are its two flattest axes.
+    cube = _flat(block[:2, np.argsort(np.abs(block[2, :3]))[:2]].T)
+    apart = block[:2, 3] - finger
+    least = np.inf
+    for axis in (*hand, *cube):
+        reach = _HALF * np.abs(cube @ axis).sum() + np.abs(hand @ axis) @ _FINGER_HALF_M
+        distance = float(apart @ axis)
+        if abs(distance) >= reach:
+            return 0.0
+        # Along this axis it leaves on the side that the direction leads to.
+        along = float(direction @ axis)
+        if abs(along) > _STILL_M:
+            least = min(least, (reach - np.sign(along) * distance) / abs(along))
+    return float(least)
+
+
+def _flat(axes: np.ndarray) -> np.ndarray:
+    """Return horizontal axes (2, 2), as rows, with length 1."""
+    return axes / np.linalg.norm(axes, axis=1, keepdims=True)
+
+
+def drag_drawer(opening_m: float, tool: np.ndarray) -> float:
+    """Return how far the drawer is open when closed fingers are where they are.
+
+    Fingers between the bar and the front keep to that gap.
+    """
+    x, y, z = tool[:3, 3]
+    low = z - _FINGER_BELOW_M < _BAR_TOP_M and abs(y) < _BAR_HALF_WIDTH_M
+    bar = HANDLE_CLOSED_M[0] - opening_m
+    if not low or not bar < x < bar + HANDLE_GAP_M:
+        return opening_m
+    least = HANDLE_CLOSED_M[0] + BAR_HALF_M - (x - _FINGER_HALF_M[0])
+    most = HANDLE_CLOSED_M[0] + HANDLE_GAP_M - (x + _FINGER_HALF_M[0])
+    return float(np.clip(np.clip(opening_m, least, most), 0.0, TRAVEL_M))

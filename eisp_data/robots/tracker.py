@@ -1,0 +1,211 @@
+"""From images and joint readings to where everything is: the tracker of one cell."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+
+from eisp_data.errors import RobotError
+from eisp_data.robots.aruco import MarkerDetector
+from eisp_data.robots.calibration import Calibration
+from eisp_data.robots.estimates import Estimates, ObjectEstimate
+from eisp_data.robots.kinematics import kinematics
+from eisp_data.robots.markers import marked_objects
+from eisp_data.robots.pose import PoseFit, Priors, View, fit_pose, fit_slide
+from eisp_data.robots.robot import CameraFrame, Reading
+from eisp_data.robots.tool_history import ToolHistory
+from eisp_data.robots.tracks import HALF_M, BlockTrack, DrawerTrack
+from eisp_data.sim.drawer import TRAY_CENTRE_M
+from eisp_data.tasks.base import Task
+
+_TILT_STD, _HEIGHT_STD_M = 0.01, 0.0007
+"""Of a block that stands on something."""
+_ANY_TILT_STD = 0.5
+"""Of one that does not: it only says which of two mirror images it is."""
+_HELD_TILT_STD = 0.1
+_STANDS_M, _STANDS_STD = 0.006, 3.0
+"""How far off its place a standing block may seem: so far, and so many standard deviations."""
+_FALL_M = 0.02
+"""A block that is let go of falls no further."""
+_TRAY_HALF_M = (0.060, 0.070)
+_UNKNOWN_IMAGES = 5
+"""A marker has to be seen so often to be one."""
+_MOVED_PX = 4.0
+"""The table's markers so far off where the calibration has them mean that the camera moved."""
+_OPENS = np.array([-1.0, 0.0, 0.0])
+
+
+class Tracker:
+    """Keeps track of the objects of a task."""
+
+    def __init__(self, task: Task, calibration: Calibration, camera: str, arm: str) -> None:
+        """Begin with nothing seen.
+
+        Args:
+            task: whose objects are on the table.
+            calibration: of the cell.
+            camera: which of its cameras to use.
+            arm: a name of ``kinematics.ARMS``.
+        """
+        to_task = calibration.transform_base_to_task
+        self._view = View(calibration.cameras[camera], to_task)
+        self._tools = ToolHistory(kinematics(arm), to_task)
+        self._detector = MarkerDetector()
+        self._marked = marked_objects(task)
+        self._known = {m.number for item in self._marked.values() for m in item.markers}
+        self._blocks = {f"block{i}": BlockTrack() for i in range(task.blocks)}
+        self._drawer = DrawerTrack() if task.fixtures else None
+        self._sequence: int | None = None
+        self._unknown: Counter[int] = Counter()
+        self._off_px: float | None = None
+
+    def update(self, reading: Reading, frame: CameraFrame | None = None) -> Estimates:
+        """Take in a reading and, if it is a new one, an image; return what is believed now."""
+        tool = self._tools.add(reading)
+        if frame is not None and frame.sequence != self._sequence:
+            self._sequence = frame.sequence
+            self._see(frame)
+        before = None if self._drawer is None else self._drawer.opening_m
+        if self._drawer is not None:
+            self._drawer.follow(tool)
+        for name, block in self._blocks.items():
+            if self._drawer is not None and before is not None and self._in_tray(block.pose):
+                block.shift((self._drawer.opening_m or 0.0 - before) * _OPENS)
+            block.follow(tool, self._standing_height(name))
+        return self.estimates()
+
+    def estimates(self) -> Estimates:
+        """Return what is believed at the time of the last reading."""
+        tool = self._tools.newest
+        objects = {}
+        for name, block in self._blocks.items():
+            if block.pose is not None:
+                objects[name] = ObjectEstimate(
+                    transform_object_to_task=block.pose,
+                    velocity=block.velocity,
+                    spin=block.spin,
+                    age_s=tool.time_s - block.seen_s,
+                    held=block.held,
+                )
+        if self._drawer is not None and self._drawer.opening_m is not None:
+            pose = np.eye(4)
+            pose[:3, 3] = self._drawer.opening_m * _OPENS
+            objects["drawer"] = ObjectEstimate(
+                transform_object_to_task=pose,
+                velocity=self._drawer.speed_m_s * _OPENS,
+                spin=np.zeros(3),
+                age_s=tool.time_s - self._drawer.seen_s,
+                held=False,
+            )
+        return Estimates(tool=tool, objects=objects)
+
+    def missing(self) -> list[str]:
+        """Return the objects that have not been seen yet."""
+        names = [name for name, block in self._blocks.items() if block.pose is None]
+        if self._drawer is not None and self._drawer.opening_m is None:
+            names.append("drawer")
+        return names
+
+    def check(self) -> None:
+        """Raise RobotError where what the camera shows cannot be this cell.
+
+        A marker of no object is in view, an object has not been seen, or the markers on the table
+        are not where the calibration has them.
+        """
+        if self._off_px is not None and self._off_px > _MOVED_PX:
+            raise RobotError(
+                f"the table's markers are {self._off_px:.0f} pixels from where the calibration has "
+                "them: the camera was moved, or this is the calibration of another cell; run "
+                "eisp-calibrate"
+            )
+        strange = sorted(n for n, count in self._unknown.items() if count >= _UNKNOWN_IMAGES)
+        if strange:
+            raise RobotError(
+                f"unknown marker {', '.join(map(str, strange))} in view; this task has markers "
+                f"{', '.join(map(str, sorted(self._known)))}"
+            )
+        for name in self.missing():
+            numbers = ", ".join(str(marker.number) for marker in self._marked[name].markers)
+            raise RobotError(f"the camera does not see {name}; its markers are {numbers}")
+
+    def _see(self, frame: CameraFrame) -> None:
+        found = self._detector.detect(frame.image)
+        self._unknown.update(n for n in found.numbers.tolist() if n not in self._known)
+        rays = dict(zip(found.numbers.tolist(), self._view.undistort(found.corners), strict=True))
+        corners = dict(zip(found.numbers.tolist(), found.corners, strict=True))
+        self._watch_table(corners)
+        then = self._tools.at(frame.captured_s)
+        since = self._tools.since(frame.captured_s)
+        if self._drawer is not None:
+            guess = self._drawer.opening_m or 0.0
+            slid = fit_slide(self._view, self._marked["drawer"], rays, _OPENS, guess)
+            if slid is not None:
+                self._drawer.see(slid[0], frame.captured_s, since)
+        for name, block in self._blocks.items():
+            fit = self._fit_block(name, block, rays, then)
+            if fit is not None:
+                block.see(fit, frame.captured_s, then, since)
+
+    def _fit_block(
+        self, name: str, block: BlockTrack, rays: dict[int, np.ndarray], tool_then: np.ndarray
+    ) -> PoseFit | None:
+        """Return the block's pose, with what is known of one that is held or stands."""
+        item, guess = self._marked[name], block.expected(tool_then)
+        if block.held and guess is not None:
+            return fit_pose(self._view, item, rays, guess, Priors(_HELD_TILT_STD))
+        fit = fit_pose(self._view, item, rays, guess, Priors(_ANY_TILT_STD))
+        if fit is None:
+            return None
+        pose = fit.transform_object_to_task
+        slack = max(_STANDS_M, _STANDS_STD * fit.position_std_m)
+        heights = [height + HALF_M for height in self._surfaces(name, pose)]
+        height = min(heights, key=lambda h: abs(h - pose[2, 3]))
+        if abs(height - pose[2, 3]) > slack:
+            return fit
+        priors = Priors(_TILT_STD, height, _HEIGHT_STD_M)
+        standing = fit_pose(self._view, item, rays, pose, priors)
+        tipped = standing is None or standing.error_px > 2 * fit.error_px + 0.3
+        return fit if tipped else standing
+
+    def _surfaces(self, name: str, pose: np.ndarray) -> list[float]:
+        """Return the heights (m) of all that a block may stand on where it is."""
+        heights = [0.0]
+        if self._in_tray(pose):
+            heights.append(TRAY_CENTRE_M[2] - HALF_M)
+        for other, block in self._blocks.items():
+            if other != name and block.pose is not None and not block.held:
+                apart = np.abs(block.pose[:2, 3] - pose[:2, 3])
+                if (apart < 1.8 * HALF_M).all():
+                    heights.append(float(block.pose[2, 3]) + HALF_M)
+        return heights
+
+    def _standing_height(self, name: str) -> float:
+        """Return the height at which a block stands if it is let go of here, metres."""
+        pose = self._blocks[name].pose
+        if pose is None:
+            return 0.0
+        below = [
+            height + HALF_M
+            for height in self._surfaces(name, pose)
+            if abs(height + HALF_M - pose[2, 3]) < _FALL_M
+        ]
+        return max(below, default=float(pose[2, 3]))
+
+    def _in_tray(self, pose: np.ndarray | None) -> bool:
+        if self._drawer is None or self._drawer.opening_m is None or pose is None:
+            return False
+        x, y, z = pose[:3, 3] - np.array(TRAY_CENTRE_M) - self._drawer.opening_m * _OPENS
+        return abs(x) < _TRAY_HALF_M[0] and abs(y) < _TRAY_HALF_M[1] and abs(z) < 2 * HALF_M
+
+    def _watch_table(self, corners: dict[int, np.ndarray]) -> None:
+        """Note how far the table's markers are from where the calibration has them."""
+        distances = [
+            np.linalg.norm(self._view.project(marker.corners()) - corners[marker.number], axis=1)
+            for marker in self._marked["table"].markers
+            if marker.number in corners
+        ]
+        if distances:
+            # The median: one that is half covered says nothing of the camera.
+            off = float(np.median(np.concatenate(distances)))
+            self._off_px = off if self._off_px is None else 0.7 * self._off_px + 0.3 * off

@@ -1,0 +1,234 @@
+"""What is believed about each object from one image to the next, and while none shows it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from eisp_data.robots.cell import inverse
+from eisp_data.robots.contact import drag_drawer, push_out
+from eisp_data.robots.pose import PoseFit
+from eisp_data.robots.tool_history import ToolState
+from eisp_data.sim.scene import BLOCK_SIZE_M
+
+HALF_M = BLOCK_SIZE_M / 2
+
+_STILL_M, _STILL_RAD = 0.0015, 0.02
+"""What moved less from one image to the next stands still: that much is noise."""
+_SMOOTHING = 0.3
+"""Weight of a new image of what stands still."""
+_SLACK_M, _SLACK_M_S, _MOST_SLACK_M = 0.035, 0.8, 0.15
+"""How far from where it was believed to be an object may turn up at once; further off, another
+image has to say the same."""
+_AGREE_M = 0.012
+_GRASP_LOW_M, _GRASP_HIGH_M = 0.040, 0.057
+"""Openings at which the fingers may hold a block."""
+_OPENING_M = 0.0005
+"""Fingers that move apart by more from one reading to the next do not grasp."""
+_BETWEEN_M = np.array([0.030, 0.020, 0.032])
+"""How far off the middle of the fingers a held block may be."""
+_GRASP_STD_M, _SLIP_STD_M = 0.002, 0.0003
+"""How well it is known where the fingers have grasped a block, and what it slips by from one image
+to the next."""
+_LOST_GRIP_M = 0.025
+_CONTRADICTIONS = 2
+
+
+class BlockTrack:
+    """One block.
+
+    Attributes:
+        pose: (4, 4) object to task at the last tool state, None before it was first seen.
+        velocity, spin: (3,) m/s and rad/s, in the task's frame.
+        seen_s: when the last image that shows it was captured.
+        held: whether the fingers hold it.
+    """
+
+    def __init__(self) -> None:
+        self.pose: np.ndarray | None = None
+        self.velocity: np.ndarray = np.zeros(3)
+        self.spin: np.ndarray = np.zeros(3)
+        self.seen_s = -np.inf
+        self._grasp: np.ndarray | None = None
+        self._grasp_variance = np.zeros((3, 3))
+        self._seen: np.ndarray | None = None
+        self._elsewhere: np.ndarray | None = None
+        self._contradictions = 0
+        self._tool: ToolState | None = None
+
+    @property
+    def held(self) -> bool:
+        """Whether the fingers hold it."""
+        return self._grasp is not None
+
+    def expected(self, tool_then: np.ndarray) -> np.ndarray | None:
+        """Return its (4, 4) pose at a time when the tool was at (4, 4)."""
+        return tool_then @ self._grasp if self._grasp is not None else self.pose
+
+    def see(
+        self, fit: PoseFit, captured_s: float, tool_then: np.ndarray, tools: list[ToolState]
+    ) -> None:
+        """Take in what an image shows.
+
+        Args:
+            fit: its pose then.
+            captured_s: when.
+            tool_then: (4, 4), the tool's pose then.
+            tools: the tool's states since.
+        """
+        pose = fit.transform_object_to_task
+        believed = self.expected(tool_then)
+        if believed is not None and self._is_elsewhere(pose, believed, captured_s):
+            return
+        passed = captured_s - self.seen_s
+        self.seen_s = captured_s
+        if self._grasp is not None:
+            self._refine_grasp(inverse(tool_then) @ pose, fit.covariance, tool_then[:3, :3])
+            return
+        self._measure_motion(pose, passed)
+        still = not self.velocity.any()
+        if still and believed is not None and self._seen is not None:
+            pose = pose.copy()
+            step = pose[:3, 3] - believed[:3, 3]
+            if np.linalg.norm(step) < 2 * _STILL_M:
+                pose[:3, 3] = believed[:3, 3] + _SMOOTHING * step
+        self._seen = fit.transform_object_to_task
+        self.pose = pose
+        before = tool_then
+        for tool in tools:
+            self._push(before, tool)
+            before = tool.transform_tool_to_task
+
+    def follow(self, tool: ToolState, standing_m: float) -> None:
+        """Go on to the tool's newest state: held, pushed, let go of or left alone.
+
+        Args:
+            tool: the state.
+            standing_m: height at which the block would stand where it is.
+        """
+        before, self._tool = self._tool, tool
+        if self.pose is None or before is None:
+            return
+        if self._grasp is not None:
+            if not _GRASP_LOW_M < tool.opening_m < _GRASP_HIGH_M:
+                self._let_go(standing_m)
+            else:
+                self.pose = tool.transform_tool_to_task @ self._grasp
+                arm = self.pose[:3, 3] - tool.transform_tool_to_task[:3, 3]
+                self.velocity = tool.velocity + np.cross(tool.spin, arm)
+                self.spin = tool.spin
+            return
+        self._push(before.transform_tool_to_task, tool)
+        if tool.time_s - self.seen_s > 0.1:
+            self.velocity, self.spin = np.zeros(3), np.zeros(3)
+        closing = tool.opening_m < before.opening_m + _OPENING_M
+        if closing and _GRASP_LOW_M < tool.opening_m < _GRASP_HIGH_M:
+            self._grasp_if_between(tool)
+
+    def shift(self, way: np.ndarray) -> None:
+        """Move with what it lies in, by (3,) m."""
+        if self.pose is not None and not self.held:
+            self.pose = self.pose.copy()
+            self.pose[:3, 3] += way
+
+    def _is_elsewhere(self, pose: np.ndarray, believed: np.ndarray, captured_s: float) -> bool:
+        """Return whether to wait for another image before believing this one."""
+        slack = min(_SLACK_M + _SLACK_M_S * (captured_s - self.seen_s), _MOST_SLACK_M)
+        if self.held:
+            slack = _LOST_GRIP_M
+        if np.linalg.norm(pose[:3, 3] - believed[:3, 3]) <= slack:
+            self._elsewhere, self._contradictions = None, 0
+            return False
+        if self._elsewhere is not None:
+            same = np.linalg.norm(pose[:3, 3] - self._elsewhere[:3, 3]) <= _AGREE_M
+            self._contradictions = self._contradictions + 1 if same or self.held else 1
+        else:
+            self._contradictions = 1
+        self._elsewhere = pose
+        if self._contradictions < _CONTRADICTIONS:
+            return True
+        self._elsewhere, self._contradictions, self._grasp, self._seen = None, 0, None, None
+        return False
+
+    def _measure_motion(self, pose: np.ndarray, passed_s: float) -> None:
+        """Set the velocities from this pose and the one seen before."""
+        self.velocity, self.spin = np.zeros(3), np.zeros(3)
+        if self._seen is None or not 0 < passed_s < 0.2:
+            return
+        way = pose[:3, 3] - self._seen[:3, 3]
+        if np.linalg.norm(way) > _STILL_M:
+            self.velocity = way / passed_s
+        turn = pose[:3, :3] @ self._seen[:3, :3].T
+        vector = np.array(
+            [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
+        )
+        if np.linalg.norm(vector) > 2 * _STILL_RAD:
+            self.spin = vector / 2 / passed_s
+
+    def _push(self, tool_before: np.ndarray, tool: ToolState) -> None:
+        assert self.pose is not None
+        here = tool.transform_tool_to_task
+        way = here[:3, 3] - tool_before[:3, 3]
+        self.pose = push_out(self.pose, here, tool.opening_m, way)
+
+    def _grasp_if_between(self, tool: ToolState) -> None:
+        assert self.pose is not None
+        grasp = inverse(tool.transform_tool_to_task) @ self.pose
+        if (np.abs(grasp[:3, 3]) < _BETWEEN_M).all():
+            # The fingers meet in the middle.
+            grasp[1, 3] = 0.0
+            self._grasp, self._grasp_variance = grasp, _GRASP_STD_M**2 * np.eye(3)
+            self.pose = tool.transform_tool_to_task @ grasp
+
+    def _refine_grasp(
+        self, measured: np.ndarray, covariance: np.ndarray, rotation: np.ndarray
+    ) -> None:
+        """Take in a measured grasp (4, 4): a Kalman filter of what does not change, but slips."""
+        assert self._grasp is not None
+        noise = rotation.T @ covariance @ rotation
+        before = self._grasp_variance + _SLIP_STD_M**2 * np.eye(3)
+        gain = before @ np.linalg.inv(before + noise)
+        refined = self._grasp.copy()
+        refined[:3, 3] += gain @ (measured[:3, 3] - self._grasp[:3, 3])
+        refined[1, 3] = 0.0
+        self._grasp, self._grasp_variance = refined, (np.eye(3) - gain) @ before
+
+    def _let_go(self, standing_m: float) -> None:
+        """Leave it where it is: on what is below it, if that is near."""
+        assert self.pose is not None
+        self._grasp = self._seen = None
+        self.velocity, self.spin = np.zeros(3), np.zeros(3)
+        self.pose = self.pose.copy()
+        self.pose[2, 3] = standing_m
+
+
+class DrawerTrack:
+    """The drawer.
+
+    Attributes:
+        opening_m: at the last tool state, None before it was first seen.
+        speed_m_s: at which it opens.
+        seen_s: when the last image that shows it was captured.
+    """
+
+    def __init__(self) -> None:
+        self.opening_m: float | None = None
+        self.speed_m_s = 0.0
+        self.seen_s = -np.inf
+        self._seen_m: float | None = None
+
+    def see(self, opening_m: float, captured_s: float, tools: list[ToolState]) -> None:
+        """Take in what an image shows; ``tools`` are the tool's states since then."""
+        passed = captured_s - self.seen_s
+        self.speed_m_s = 0.0
+        if self._seen_m is not None and 0 < passed < 0.2:
+            way = opening_m - self._seen_m
+            self.speed_m_s = way / passed if abs(way) > _STILL_M / 3 else 0.0
+        self.seen_s, self._seen_m = captured_s, opening_m
+        self.opening_m = opening_m
+        for tool in tools:
+            self.follow(tool)
+
+    def follow(self, tool: ToolState) -> None:
+        """Go on to the tool's newest state."""
+        if self.opening_m is not None:
+            self.opening_m = drag_drawer(self.opening_m, tool.transform_tool_to_task)
