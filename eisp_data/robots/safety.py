@@ -135,6 +135,11 @@ class SafetyFilter:
         self._brake()
         return JointCommand(self._position.copy(), self._opening)
 
+    def allows(self, joint_position: np.ndarray) -> bool:
+        """Whether the arm may stand at (J,) rad: within limits and workspace, and clear."""
+        outside = self._outside(joint_position, self._tool_in_task(joint_position))
+        return outside <= 0.0 and (self._is_clear is None or self._is_clear(joint_position))
+
     @property
     def stopped(self) -> bool:
         """Whether the targets have come to rest."""
