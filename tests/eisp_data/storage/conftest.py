@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from storage_samples import random_episode, spec_of
 
@@ -31,8 +32,12 @@ def make_dataset(tmp_path: Path) -> Callable[..., tuple[Path, list[Episode]]]:
         spec = spec_of(cameras, **changes)
         episodes = [random_episode(spec, 6 + i, seed + i) for i in range(count)]
         with DatasetWriter(tmp_path / name, spec, {"policy": "script", "seed": seed}) as writer:
-            writer.write(episodes[:2])
-            writer.write(episodes[2:])
+            for part in (episodes[:2], episodes[2:]):
+                extras = [
+                    {n: np.zeros((len(e), w), np.float32) for n, w in spec.extras.items()}
+                    for e in part
+                ]
+                writer.write(part, extras)
         return tmp_path / name, episodes
 
     return make

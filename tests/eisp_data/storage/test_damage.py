@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import shutil
 from collections import Counter
 from pathlib import Path
@@ -23,6 +24,8 @@ from eisp_data.storage.repair import repair
 from eisp_data.storage.validate import validate
 
 MUTATIONS = int(os.environ.get("EISP_MUTATIONS", "40"))
+MEMORY_BYTES = 700 * 2**20
+"""How much more the process may ever take while it reads damaged files."""
 
 
 def failed(root):
@@ -211,7 +214,8 @@ def mutate(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def test_mutated_files_give_a_line_or_a_right_result(make_dataset, tmp_path):
-    root, episodes = make_dataset(cameras=True)
+    root, episodes = make_dataset(cameras=True, extras={"repeated.top": 1, "age_s.top": 1})
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     by_seed = {episode.seed: episode for episode in episodes}
     files = sorted(p.relative_to(root) for p in root.rglob("*") if p.is_file())
     outcomes: Counter[str] = Counter()
@@ -225,7 +229,9 @@ def test_mutated_files_give_a_line_or_a_right_result(make_dataset, tmp_path):
         chosen.write_bytes(mutate(chosen.read_bytes(), rng))
         outcomes[_look(copy, fixed, by_seed)] += 1
     assert sum(outcomes.values()) == MUTATIONS
-    print(dict(outcomes))
+    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024
+    print(f"{MUTATIONS} mutations, {grown / 2**20:.0f} MiB more: {dict(outcomes)}")
+    assert grown < MEMORY_BYTES
 
 
 def _look(root: Path, fixed: Path, by_seed: dict) -> str:

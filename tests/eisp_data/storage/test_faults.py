@@ -9,7 +9,6 @@ import json
 import os
 import random
 import resource
-import signal
 import subprocess
 import sys
 import time
@@ -18,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from nursery import Nursery
 from storage_samples import assert_same, random_episode, spec_of
 
 from eisp_data.errors import DataError
@@ -28,70 +28,28 @@ from eisp_data.storage.validate import validate
 KILLS = int(os.environ.get("EISP_KILLS", "6"))
 BATCH = 3
 
-# Imports once and forks a writer for each line it reads, so that a kill costs no start-up.
-NURSERY = """
-import os, sys
-sys.path.insert(0, sys.argv[1])
+COLLECT = """
 import av, pandas
 from storage_samples import random_episode, spec_of
 from eisp_data.storage.lerobot import DatasetWriter
 spec = spec_of(cameras=True)
 
-def collect(root):
+def work(root):
     with DatasetWriter(root, spec, {"kind": "kill"}, resume=True) as writer:
-        print("open", writer.num_episodes, flush=True)
+        say("open", writer.num_episodes)
         while True:
             first = writer.num_episodes
             writer.write([random_episode(spec, 6, first + i) for i in range(3)])
-            print("wrote", writer.num_episodes, flush=True)
-
-for line in sys.stdin:
-    pid = os.fork()
-    if not pid:
-        collect(line.strip())
-    print("pid", pid, flush=True)
-    os.waitpid(pid, 0)
-    print("dead", flush=True)
+            say("wrote", writer.num_episodes)
 """
 
 
-class Nursery:
-    """Starts writers and kills them."""
-
-    def __init__(self) -> None:
-        here = str(Path(__file__).parent)
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", NURSERY, here],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-
-    def kill_one(self, root: Path, batches: int, delay_s: float) -> int:
-        """Start a writer, kill it some time after so many batches; return what it promised."""
-        assert self._process.stdin is not None and self._process.stdout is not None
-        self._process.stdin.write(f"{root}\n")
-        self._process.stdin.flush()
-        pid = promised = wrote = 0
-        opened = False
-        while not pid or not opened or wrote < batches:
-            word, number = self._process.stdout.readline().split()
-            if word == "pid":
-                pid = int(number)
-            else:
-                opened, promised = True, int(number)
-                wrote += word == "wrote"
-        time.sleep(delay_s)
-        os.kill(pid, signal.SIGKILL)
-        while (line := self._process.stdout.readline().split()) != ["dead"]:
-            promised = int(line[1])
-        return promised
-
-    def close(self) -> None:
-        """End the nursery."""
-        assert self._process.stdin is not None
-        self._process.stdin.close()
-        self._process.wait()
+def kill_one(nursery: Nursery, root: Path, batches: int, delay_s: float) -> int:
+    """Start a writer, kill it some time after so many batches; return what it promised."""
+    nursery.start(root)
+    said = [nursery.line() for _ in range(1 + batches)]
+    time.sleep(delay_s)
+    return int([*said, *nursery.kill()][-1][1])
 
 
 def check_upstream(root: Path, episodes: int, frames: int) -> None:
@@ -115,32 +73,31 @@ def test_a_kill_at_any_moment_loses_at_most_the_batch_in_hand(tmp_path, monkeypa
     monkeypatch.setattr("datasets.config.HF_DATASETS_CACHE", str(tmp_path / "hf"))
     spec = spec_of(cameras=True)
     draw = random.Random(1)
-    nursery = Nursery()
     root, states = tmp_path / "killed", Counter[str]()
-    for kill in range(KILLS):
-        if kill % 10 == 0:
-            root = tmp_path / f"killed-{kill}"
-        promised = nursery.kill_one(root, draw.randrange(3), draw.uniform(0, 0.06))
-        kept = list(read_episodes(root, images=True)) if (root / "data").exists() else []
-        # What the writer said is there; at most one more batch can be, whole.
-        assert len(kept) in (promised, promised + BATCH)
-        for number, episode in enumerate(kept):
-            assert_same(random_episode(spec, 6, number), episode)
-        if not kept:
-            states["killed before the first batch"] += 1
-            continue
-        bad = [check.name for check in validate(root) if not check.passed]
-        assert set(bad) <= {"episode count", "frame count", "no stray files", "statistics"}, bad
-        states[", ".join(bad) or "nothing to mend"] += 1
-        stated = json.loads((root / "meta/info.json").read_text())
-        if stated["total_episodes"]:
-            check_upstream(root, stated["total_episodes"], stated["total_frames"])
-        if kill % 5 == 0:
-            copy = repair(root, tmp_path / f"repaired-{kill}").copy
-            assert all(check.passed for check in validate(copy))
-            for ours, theirs in zip(kept, read_episodes(copy), strict=True):
-                assert_same(ours, theirs)
-    nursery.close()
+    with Nursery(COLLECT) as nursery:
+        for kill in range(KILLS):
+            if kill % 10 == 0:
+                root = tmp_path / f"killed-{kill}"
+            promised = kill_one(nursery, root, draw.randrange(3), draw.uniform(0, 0.06))
+            kept = list(read_episodes(root, images=True)) if (root / "data").exists() else []
+            # What the writer said is there; at most one more batch can be, whole.
+            assert len(kept) in (promised, promised + BATCH)
+            for number, episode in enumerate(kept):
+                assert_same(random_episode(spec, 6, number), episode)
+            if not kept:
+                states["killed before the first batch"] += 1
+                continue
+            bad = [check.name for check in validate(root) if not check.passed]
+            assert set(bad) <= {"episode count", "frame count", "no stray files", "statistics"}, bad
+            states[", ".join(bad) or "nothing to mend"] += 1
+            stated = json.loads((root / "meta/info.json").read_text())
+            if stated["total_episodes"]:
+                check_upstream(root, stated["total_episodes"], stated["total_frames"])
+            if kill % 5 == 0:
+                copy = repair(root, tmp_path / f"repaired-{kill}").copy
+                assert all(check.passed for check in validate(copy))
+                for ours, theirs in zip(kept, read_episodes(copy), strict=True):
+                    assert_same(ours, theirs)
     print(dict(states))
     DatasetWriter(root, spec, {"kind": "kill"}, resume=True).close()
     if (root / "data").exists():
