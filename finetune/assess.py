@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from eisp_data.errors import ConfigError
+from eisp_data.tasks.images import state_task
 from eisp_data.tasks.registry import TASKS
 from finetune.config import EvaluateConfig
 from finetune.evaluate import Evaluation, evaluate
@@ -29,10 +30,10 @@ def assess(config: EvaluateConfig) -> Evaluation:
     film = Film()
     result = evaluate(
         agent,
-        make_worlds(name, min(_BATCH, config.episodes)),
+        make_worlds(agent, min(_BATCH, config.episodes)),
         config.episodes,
         config.seed,
-        oracle=oracle_return(name, min(_ORACLE_EPISODES, config.episodes), config.seed),
+        oracle=oracle_return(state_task(name), min(_ORACLE_EPISODES, config.episodes), config.seed),
         device=device,
         watch=film if config.video else None,
     )

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from eisp_data.sim.gym_worlds import AnyWorlds
+from eisp_data.tasks.images import state_task
 from eisp_data.tasks.registry import TASKS
 from finetune.oracle import subgoal_policy
 from finetune.rollout import SubgoalPolicy
@@ -108,7 +109,7 @@ def evaluate(
     counts = [
         np.histogram(distance[chosen], bins=[*_EDGES_M, np.inf])[0] for chosen in (~last, last)
     ]
-    task = TASKS.get(worlds.name)
+    task = TASKS.get(state_task(worlds.name))
     return Evaluation(
         task=worlds.name,
         episodes=episodes,

@@ -73,8 +73,10 @@ def _figure(estimate: Mapping[str, float] | None, form: Callable[[float], str]) 
 
 def _relative(value: float, oracle: float | None, task: str) -> Figure:
     """Return (R + L) / (R_oracle + L)."""
+    from eisp_data.tasks.images import state_task
     from eisp_data.tasks.registry import TASKS
 
+    task = state_task(task)
     if oracle is None or task not in TASKS:
         return _UNKNOWN
     length = TASKS[task].paper.episode_steps

@@ -12,10 +12,9 @@ import torch
 from eisp_data.cli.collect import episode_seeds
 from eisp_data.collect import explore
 from eisp_data.config import load_yaml
-from eisp_data.errors import ConfigError, DataError
+from eisp_data.errors import ConfigError
 from eisp_data.sim.gym_worlds import AnyWorlds, GymWorlds
 from eisp_data.sim.worlds import Worlds
-from eisp_data.storage.cache import load_arrays
 from eisp_data.storage.files import write_json
 from eisp_data.tasks.registry import TASKS
 from finetune.config import FinetuneConfig
@@ -29,6 +28,8 @@ from pretrain.presets import preset
 from pretrain.replay import Trajectories
 from pretrain.saved import find_policy
 from pretrain.train import begin_run, gather, has_progress
+from pretrain.vision import load_seen
+from vqvae.worlds import ImageWorlds
 
 _FIRST_EPISODES = 100
 """Episodes of random actions before learning from nothing."""
@@ -59,7 +60,7 @@ def finetune(config: FinetuneConfig) -> dict[str, float]:
         run,
         agent.to(device),
         data,
-        lambda count: make_worlds(name, count),
+        lambda count: make_worlds(agent, count),
         config.online,
         config.seed,
         device,
@@ -97,8 +98,11 @@ def _check(config: FinetuneConfig) -> None:
     check_subgoals(config.subgoals, "--subgoals")
 
 
-def make_worlds(name: str, count: int) -> AnyWorlds:
-    """Return worlds of a task, or of a registered GoalEnv."""
+def make_worlds(agent: Agent, count: int) -> AnyWorlds:
+    """Return worlds of the agent's task, or of a registered GoalEnv, as the agent sees them."""
+    name = agent.config.task
+    if agent.vision and agent.config.vision:
+        return ImageWorlds(name, agent.vision, agent.config.vision, count)
     return Worlds(TASKS[name], count) if name in TASKS else GymWorlds(name, count)
 
 
@@ -114,11 +118,7 @@ def load_for_rollouts(path: Path | None, subgoals: SubgoalConfig, device: str) -
 def _dataset(config: FinetuneConfig, agent: Agent) -> Trajectories:
     """Return all episodes of the dataset that the agent was pretrained on."""
     root = config.dataset.root or _pretraining_dataset(config.policy.path)
-    arrays = load_arrays(root)
-    if arrays.spec.task != agent.config.task:
-        raise DataError(
-            f"{root} is a dataset of {arrays.spec.task!r}, the policy one of {agent.config.task!r}"
-        )
+    arrays = load_seen(root, agent.config, agent.vision)
     every = np.arange(arrays.num_episodes)
     return gather(arrays, every, agent.layout, agent.config.waypoints)
 

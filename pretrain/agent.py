@@ -20,6 +20,7 @@ from pretrain.proposers.movers import Movers
 from pretrain.proposers.proposer import SubgoalProposer
 from pretrain.sac import Sac
 from pretrain.saved import writing
+from vqvae.model import VqVae
 
 BANK = 4096
 """Achieved goals of the dataset that an agent carries with it, for random subgoals."""
@@ -59,6 +60,7 @@ class Agent(nn.Module):
             else Hybrid(layout, moments, config.hybrid)
         )
         self.register_buffer("bank", bank)
+        self.vision = VqVae(config.vision.model).requires_grad_(False) if config.vision else None
 
     def save(self, folder: Path) -> None:
         """Write ``config.json`` and ``model.safetensors``, each whole or not at all."""

@@ -10,8 +10,10 @@ from eisp_data.cli.run import fail, run
 from eisp_data.cli.words import given, saved_run, take
 from eisp_data.errors import ConfigError, EispError
 from eisp_data.storage.reader import read_spec
+from eisp_data.tasks.images import image_task
 from pretrain.config import PretrainConfig
-from pretrain.presets import PresetName, preset
+from pretrain.presets import PresetName, image_preset, preset
+from vqvae.saved import load_config
 
 
 def main() -> None:
@@ -44,6 +46,12 @@ def _start(words: list[str]) -> tuple[list[str], PretrainConfig | None]:
     _, root = take(words, "--dataset.root")
     if root is None and not (given(words, "--help") or given(words, "-h")):
         raise ConfigError("missing --dataset.root, the folder of a dataset (see eisp-collect)")
+    _, vqvae = take(words, "--vqvae.path")
+    if root and vqvae:
+        vision = load_config(Path(vqvae))
+        folder = Path("runs") / f"{image_task(vision.task)}_pretrain"
+        known = cast(PresetName, name)
+        return words, image_preset(known, vision, Path(vqvae), Path(root), folder)
     task = read_spec(Path(root)).task if root else "stack"
     folder = Path("runs") / f"{task}_pretrain"
     return words, preset(cast(PresetName, name), task, Path(root or "data/stack"), folder)

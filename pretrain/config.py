@@ -8,7 +8,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+import tyro
+
+from vqvae.config import VisionConfig
 
 DeviceName = Literal["auto", "cpu", "cuda"]
 
@@ -113,6 +117,16 @@ class AgentConfig:
     hybrid: HybridConfig = field(default_factory=HybridConfig)
     subgoals: SubgoalConfig = field(default_factory=SubgoalConfig)
     mix: GoalMix = field(default_factory=GoalMix)
+    vision: Annotated[VisionConfig | None, tyro.conf.Suppress] = None
+    """The VQ-VAE that an image task is seen with; read from --vqvae.path."""
+
+
+@dataclass(frozen=True)
+class VqVaePath:
+    """A VQ-VAE on the disk."""
+
+    path: Path | None = None
+    """A run of eisp-vqvae train; with it the task is learned from its images."""
 
 
 @dataclass(frozen=True)
@@ -131,6 +145,7 @@ class PretrainConfig:
     output_dir: Path
     """Where the run goes."""
     agent: AgentConfig
+    vqvae: VqVaePath = field(default_factory=VqVaePath)
     updates: int = 20_000
     """Updates of SAC."""
     batch_size: int = 256

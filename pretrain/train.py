@@ -13,7 +13,7 @@ from tqdm import tqdm
 from eisp_data.config import save_yaml
 from eisp_data.errors import ConfigError, DataError
 from eisp_data.runs.metrics import MetricsLog
-from eisp_data.storage.cache import DatasetArrays, load_arrays
+from eisp_data.storage.cache import DatasetArrays
 from eisp_data.tasks.registry import TASKS
 from pretrain import checkpoint
 from pretrain.agent import BANK, Agent
@@ -23,6 +23,8 @@ from pretrain.device import describe, set_up
 from pretrain.layout import Layout
 from pretrain.learner import Learner
 from pretrain.replay import Trajectories
+from pretrain.vision import check_resumed, load_seen, load_vision
+from vqvae.model import VqVae
 
 _VALIDATION_SAMPLES = 4096
 _NEAR_M = 0.05
@@ -35,16 +37,20 @@ def pretrain(config: PretrainConfig) -> Path:
     resumed = has_progress(run, config.resume, "pretrain.yaml")
     device = set_up(config.device, config.threads)
     print(describe(device, config.threads), flush=True)
-    train, held_out, layout = load_trajectories(config)
+    vision = load_vision(config)
+    train, held_out, layout = load_trajectories(config, vision)
     torch.manual_seed(config.seed)
     rng = np.random.default_rng(config.seed)
     bank = train.achieved_goal[rng.integers(len(train), size=BANK)]
     agent = Agent(config.agent, layout, train.moments(), torch.from_numpy(bank)).to(device)
+    if agent.vision and vision:
+        agent.vision.load_state_dict(vision.state_dict())
     begin_run(run, config, "pretrain.yaml")
     learner = Learner(agent, config.agent.sac.lr, config.generator_lr, config.threads)
     done, best, best_state, spent = 0, -np.inf, {}, 0.0
     if resumed:
         done, numbers, arrays = checkpoint.restore(run, agent, learner.optimizers, rng)
+        check_resumed(agent, vision, config.vqvae.path)
         best, spent = numbers["best"], numbers["wall_s"]
         best_state = {name: torch.from_numpy(value) for name, value in arrays.items()}
     log = MetricsLog(run, "pretrain", done)
@@ -108,14 +114,11 @@ def validate(agent: Agent, held_out: Trajectories, device: str) -> dict[str, Ten
     return info | {"hits": hits.float().mean(), "near_data": near.float().mean()}
 
 
-def load_trajectories(config: PretrainConfig) -> tuple[Trajectories, Trajectories, Layout]:
+def load_trajectories(
+    config: PretrainConfig, vision: VqVae | None = None
+) -> tuple[Trajectories, Trajectories, Layout]:
     """Read the dataset into memory, split by episode into what is learned from and held out."""
-    arrays = load_arrays(config.dataset.root)
-    if arrays.spec.task != config.agent.task:
-        raise DataError(
-            f"{config.dataset.root} is a dataset of {arrays.spec.task!r}, "
-            f"not of {config.agent.task!r}"
-        )
+    arrays = load_seen(config.dataset.root, config.agent, vision)
     layout = layout_of(arrays)
     order = np.random.default_rng(config.seed).permutation(arrays.num_episodes)
     held = max(1, round(config.validation_share * arrays.num_episodes))
