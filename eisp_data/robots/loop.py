@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import sys
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -14,6 +17,8 @@ POLLS = 4
 """How often per control period new readings and images are asked for: 100 times a second at 25 Hz,
 so that a camera of 30 or 60 images a second loses none to a slower loop."""
 _NANOSECONDS = 1_000_000_000
+_MOMENT_S = 0.002
+_SWITCH_S = 0.0005
 
 
 @dataclass(frozen=True)
@@ -52,10 +57,12 @@ class Ticks:
         self._late_s: list[float] = []
         self._dropped = 0
 
-    def run(self, poll: Callable[[], None]) -> Iterator[int]:
-        """Yield each deadline in ns of the robot's clock; between two of them, call ``poll``.
+    def run(self, poll: Callable[[int], None]) -> Iterator[int]:
+        """Yield each deadline in ns of the robot's clock; the caller ends the loop by leaving it.
 
-        ``poll`` is called right before each tick too. The caller ends the loop by leaving it.
+        Args:
+            poll: called with 0 right before each tick, then with 1 to POLLS - 1, evenly spaced
+                until the next; those for which it is too late are left out.
         """
         robot, period = self._robot, self._period_ns
         # Whole nanoseconds: rows of a dataset are cut out of the log at exactly this rate.
@@ -63,13 +70,13 @@ class Ticks:
         while True:
             late_ns = round(robot.now_s() * _NANOSECONDS) - deadline
             self._late_s.append(late_ns / _NANOSECONDS)
-            poll()
+            poll(0)
             yield deadline
             for part in range(1, POLLS):
                 at = (deadline + part * period // POLLS) / _NANOSECONDS
                 if robot.now_s() <= at:
                     robot.wait_until(at)
-                    poll()
+                    poll(part)
             deadline += period
             behind = round(robot.now_s() * _NANOSECONDS) - deadline
             if behind >= period:
@@ -91,3 +98,36 @@ class Ticks:
             late_max_ms=float(late_ms.max()),
             load=os.getloadavg()[0] / (os.cpu_count() or 1),
         )
+
+
+def runs_by_itself(robot: Robot) -> bool:
+    """Return whether the connected robot's clock goes on while nobody asks: not in a simulation."""
+    before = robot.now_s()
+    time.sleep(_MOMENT_S)
+    return robot.now_s() > before
+
+
+@contextlib.contextmanager
+def priority() -> Iterator[bool]:
+    """Run before all ordinary processes, with the threads that are started meanwhile.
+
+    Without it a busy machine begins ticks some 10 ms late now and then. Yields whether the system
+    granted it; it takes ``CAP_SYS_NICE``, or an ``rtprio`` limit as in a robot vendor's set-up.
+    """
+    if not hasattr(os, "sched_setscheduler"):
+        yield False
+        return
+    before = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+    except PermissionError:
+        yield False
+        return
+    # A thread that wants the interpreter waits this long for one that does not let go of it.
+    switch_s = sys.getswitchinterval()
+    sys.setswitchinterval(_SWITCH_S)
+    try:
+        yield True
+    finally:
+        sys.setswitchinterval(switch_s)
+        os.sched_setscheduler(0, *before)

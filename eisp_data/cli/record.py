@@ -1,0 +1,22 @@
+"""``eisp-record``: a session with a robot as an MCAP recording."""
+
+from __future__ import annotations
+
+from eisp_data.cli.run import run
+from eisp_data.robots.record import RecordConfig
+
+
+def main() -> None:
+    """Run ``eisp-record``."""
+    run(_command, prog="eisp-record", config_file=True)
+
+
+def _command(config: RecordConfig) -> None:
+    """Record a session with a robot; ``eisp-data convert`` makes a dataset of the recording."""
+    from eisp_data.robots.record import record
+
+    record(config)
+
+
+if __name__ == "__main__":
+    main()
