@@ -66,7 +66,7 @@ class VqVaeEvaluation:
 def evaluate(path: Path, root: Path | None = None) -> VqVaeEvaluation:
     """Measure a VQ-VAE on the episodes of its dataset that were held out."""
     model, vision = load(path)
-    trained = _training(path)
+    trained = training_of(path)
     root = root or trained.dataset.root
     arrays, codes = load_arrays(root), load_codes(root, model, vision.camera)
     held, rest = split(arrays.num_episodes, trained.validation_share, trained.seed)
@@ -97,7 +97,8 @@ def _changed(
     return float((drawn != codes[chosen]).mean())
 
 
-def _training(path: Path) -> VqVaeTrainConfig:
+def training_of(path: Path) -> VqVaeTrainConfig:
+    """Return what a VQ-VAE was trained with."""
     for folder in (path, *path.resolve().parents):
         if (folder / CONFIG_FILE).exists():
             return load_yaml(VqVaeTrainConfig, folder / CONFIG_FILE)
