@@ -6,7 +6,7 @@ import numpy as np
 
 from eisp_data.errors import ConfigError
 from eisp_data.policies.registry import SCRIPTS
-from eisp_data.policies.script import Noise, ScriptedPolicy
+from eisp_data.policies.script import OPEN, Noise, ScriptedPolicy
 from eisp_data.sim.gym_worlds import AnyWorlds
 from eisp_data.sim.worlds import Worlds
 from eisp_data.tasks.registry import TASKS
@@ -14,6 +14,9 @@ from finetune.rollout import SubgoalPolicy
 from pretrain.agent import Agent
 from pretrain.hindsight import at_rest
 
+_LETTING_GO = np.float32([[0, 0, 0, OPEN]] * 4 + [[0, 0, 1, OPEN]] * 2)
+"""A script expects nothing in the gripper that begins it."""
+_NEARER_M = 0.01
 _LOOKAHEAD_STEPS = 80
 """Longer than any script takes for one move."""
 
@@ -47,17 +50,29 @@ class OracleSubgoals(SubgoalPolicy):
         for row, world in enumerate(renew):
             script.begin(row, state, desired_goal[row], seed=int(world))
         achieved = [achieved_goal]
-        for _ in range(_LOOKAHEAD_STEPS):
-            state = self._physics.step(state, task.control(state, script.act(state)))
+        for action in (*_LETTING_GO, *[None] * _LOOKAHEAD_STEPS):
+            if action is None:
+                actions = script.act(state)
+            else:
+                actions = np.tile(action, (len(renew), 1))
+            state = self._physics.step(state, task.control(state, actions))
             achieved.append(task.achieved_goal(state))
         paths = np.stack(achieved, axis=1)
-        rests = [at_rest(path)[0] for path in paths]
-        return np.stack(
-            [
-                path[rest[0]] if len(rest) else goal
-                for path, rest, goal in zip(paths, rests, desired_goal, strict=True)
-            ]
-        )
+        return np.stack([_first(*both) for both in zip(paths, desired_goal, strict=True)])
+
+
+def _first(path: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    """Return the first arrangement at rest that is nearer to the goal than the start of the path.
+
+    If there is none, the first at all: something has to go out of the way. What is nearer comes
+    before that, for what is being carried at the start falls out of the gripper.
+    """
+    rests = path[at_rest(path)[0]]
+    if not len(rests):
+        return goal
+    way = np.linalg.norm(rests - goal, axis=1)
+    nearer = np.flatnonzero(way < np.linalg.norm(path[0] - goal) - _NEARER_M)
+    return rests[nearer[0] if len(nearer) else 0]
 
 
 def subgoal_policy(agent: Agent, worlds: AnyWorlds, device: str) -> SubgoalPolicy:
