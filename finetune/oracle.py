@@ -51,10 +51,7 @@ class OracleSubgoals(SubgoalPolicy):
             script.begin(row, state, desired_goal[row], seed=int(world))
         achieved = [achieved_goal]
         for action in (*_LETTING_GO, *[None] * _LOOKAHEAD_STEPS):
-            if action is None:
-                actions = script.act(state)
-            else:
-                actions = np.tile(action, (len(renew), 1))
+            actions = script.act(state) if action is None else np.tile(action, (len(renew), 1))
             state = self._physics.step(state, task.control(state, actions))
             achieved.append(task.achieved_goal(state))
         paths = np.stack(achieved, axis=1)
