@@ -17,6 +17,8 @@ _Answer = TypeVar("_Answer")
 
 _LATE_PERIODS = 2.5
 """After a pause this long the arm has arrived where it was sent and stands."""
+_OVERLOAD_S = 0.2
+"""A torque beyond the limit for so long: an arm that gains speed has one for an instant."""
 
 
 class SafeRobot(Robot):
@@ -56,6 +58,7 @@ class SafeRobot(Robot):
         self._fault: str | None = "not connected"
         self._reading: Reading | None = None
         self._commanded_s: float | None = None
+        self._eased_s = -np.inf
 
     def connect(self) -> None:
         """Connect, and see that the readings are sound."""
@@ -63,6 +66,7 @@ class SafeRobot(Robot):
         # A camera may be known only now.
         self.cameras = self._robot.cameras
         self._fault = self._commanded_s = None
+        self._eased_s = self._robot.now_s()
         self.observe()
 
     def calibrate(self) -> None:
@@ -144,7 +148,9 @@ class SafeRobot(Robot):
             return "a joint reading is not a number"
         if reading.joint_effort is not None:
             share = np.abs(reading.joint_effort) / self.limits.effort
-            if not share.max() <= self.filter.config.effort_share:
+            if share.max() <= self.filter.config.effort_share:
+                self._eased_s = reading.hardware_s
+            elif not reading.hardware_s - self._eased_s <= _OVERLOAD_S:
                 joint = self.joint_names[int(np.nanargmax(share))]
                 return f"the torque of {joint} is {share.max():.0%} of its limit"
         return None
