@@ -17,15 +17,18 @@ _SILENCE_S = 1.0
 class OpenCvCamera:
     """Reads in its own thread, so that the newest frame is always at hand."""
 
-    def __init__(self, source: int | str, intrinsics: CameraIntrinsics, name: str = "top") -> None:
+    def __init__(self, source: str, width: int = 640, height: int = 480) -> None:
         """Prepare; ``open`` starts it.
 
         Args:
-            source: what ``cv2.VideoCapture`` takes.
-            intrinsics: from a calibration; the image size is asked for.
-            name: for messages.
+            source: a number, a path or an address, as ``cv2.VideoCapture`` takes them.
+            width: of the image that is asked for, pixels.
+            height: likewise.
         """
-        self.source, self.intrinsics, self.name = source, intrinsics, name
+        self.source = source
+        # No driver knows a lens: this is a usual one, until a calibration says better.
+        matrix = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]], float)
+        self.intrinsics = CameraIntrinsics(width, height, matrix)
         self._frame: CameraFrame | None = None
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
@@ -38,19 +41,20 @@ class OpenCvCamera:
         """
         import cv2
 
-        capture = cv2.VideoCapture(self.source)
+        source = int(self.source) if self.source.isdigit() else self.source
+        capture = cv2.VideoCapture(source)
         capture.set(cv2.CAP_PROP_FRAME_WIDTH, self.intrinsics.width)
         capture.set(cv2.CAP_PROP_FRAME_HEIGHT, self.intrinsics.height)
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         read, image = capture.read()
         if not read:
             capture.release()
-            raise RobotError(f"camera {self.name!r} ({self.source}) gives no image")
+            raise RobotError(f"camera {self.source!r} gives no image")
         if image.shape[:2] != (self.intrinsics.height, self.intrinsics.width):
             capture.release()
             raise RobotError(
-                f"camera {self.name!r} gives {image.shape[1]}x{image.shape[0]} pixels;"
-                f" its calibration is for {self.intrinsics.width}x{self.intrinsics.height}"
+                f"camera {self.source!r} gives {image.shape[1]}x{image.shape[0]} pixels;"
+                f" asked for were {self.intrinsics.width}x{self.intrinsics.height}"
             )
         self._closing.clear()
         self._keep(image, 0)
@@ -61,7 +65,7 @@ class OpenCvCamera:
         """Return the newest frame; RobotError if the last one is long ago."""
         frame = self._frame
         if frame is None or time.monotonic() - frame.captured_s > _SILENCE_S:
-            raise RobotError(f"camera {self.name!r} ({self.source}) is unplugged")
+            raise RobotError(f"camera {self.source!r} is unplugged")
         return frame
 
     def close(self) -> None:

@@ -70,8 +70,9 @@ class SafeRobot(Robot):
         self.observe()
 
     def calibrate(self) -> None:
-        """As the robot does."""
-        self._robot.calibrate()
+        """As the robot does; in a dry run not at all, for the gripper may move."""
+        if not self.dry_run:
+            self._guarded(self._robot.calibrate)
 
     def now_s(self) -> float:
         """As the robot does."""

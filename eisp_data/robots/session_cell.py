@@ -34,6 +34,8 @@ class CellConfig:
     """stack, push4, open_drawer or store; left out, nothing is looked for on the table."""
     host: str | None = None
     """Address of a real robot."""
+    camera_source: str | None = None
+    """Where a real robot's camera is: what OpenCV opens (0, a path), or a ROS topic for tiago."""
     calibration: Path | None = None
     """Calibration file of the cell; the twin has one of its own."""
     camera: str | None = None
@@ -137,7 +139,7 @@ def _make(config: CellConfig) -> Robot:
     elif config.robot in ROBOTS:
         if config.host is None:
             raise ConfigError(f"--robot {config.robot}: missing --host, the robot's address")
-        options = {"host": config.host}
+        options = {"host": config.host, "camera": config.camera_source}
     return make_robot(config.robot, **options)
 
 

@@ -9,8 +9,6 @@ from __future__ import annotations
 import base64
 import binascii
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -32,14 +30,6 @@ _TRAJECTORY = "trajectory_msgs/JointTrajectory"
 _SILENCE_S = 1.0
 
 
-@dataclass(frozen=True)
-class CameraTopic:
-    """A camera that ROS publishes as ``sensor_msgs/CompressedImage``."""
-
-    topic: str
-    intrinsics: CameraIntrinsics
-
-
 class TiagoRobot(Robot):
     """The left or the right arm with its parallel gripper; torso and other arm stay as they are."""
 
@@ -47,7 +37,7 @@ class TiagoRobot(Robot):
         self,
         host: str,
         side: str = "left",
-        cameras: Mapping[str, CameraTopic] | None = None,
+        camera: str | None = None,
         control_hz: float = 25.0,
     ) -> None:
         """Prepare; nothing is connected yet.
@@ -55,7 +45,8 @@ class TiagoRobot(Robot):
         Args:
             host: of the rosbridge server, with or without ``:port``.
             side: ``left`` or ``right``.
-            cameras: by name.
+            camera: topic of the camera ``top``, a ``sensor_msgs/CompressedImage`` with the
+                ``camera_info`` of its driver beside it; none if left out.
             control_hz: how often ``command`` will be called.
 
         Raises:
@@ -66,8 +57,8 @@ class TiagoRobot(Robot):
         arm = get_arm(f"tiago_{side}")
         self.name, self.arm, self.joint_names = "tiago", arm.name, arm.joint_names
         self.control_hz, self.limits = control_hz, joint_limits(arm.name)
-        self._topics = dict(cameras or {})
-        self.cameras = {name: camera.intrinsics for name, camera in self._topics.items()}
+        self._topics = {} if camera is None else {"top": camera}
+        self.cameras: dict[str, CameraIntrinsics] = {}
         self._fingers = [f"gripper_{side}_{finger}_finger_joint" for finger in ("left", "right")]
         self._arm_topic = f"/arm_{side}_controller/command"
         self._gripper_topic = f"/gripper_{side}_controller/command"
@@ -80,14 +71,12 @@ class TiagoRobot(Robot):
         try:
             self._ros.connect()
             self._ros.subscribe(_JOINT_STATES, "sensor_msgs/JointState")
-            for camera in self._topics.values():
-                self._ros.subscribe(camera.topic, "sensor_msgs/CompressedImage")
             for topic in (self._arm_topic, self._gripper_topic):
                 self._ros.advertise(topic, _TRAJECTORY)
             self._ros.wait_for(_JOINT_STATES)
-            for camera in self._topics.values():
-                self._ros.wait_for(camera.topic)
             self.observe()
+            for name, topic in self._topics.items():
+                self.cameras[name] = self._open_camera(topic)
         except RobotError:
             self.disconnect()
             raise
@@ -123,7 +112,7 @@ class TiagoRobot(Robot):
 
     def frames(self) -> dict[str, CameraFrame]:
         """Return each camera's newest frame."""
-        return {name: self._frame(name, camera) for name, camera in self._topics.items()}
+        return {name: self._frame(name, topic) for name, topic in self._topics.items()}
 
     def command(self, command: JointCommand) -> JointCommand:
         """Send arm and gripper to the targets within one control period."""
@@ -154,25 +143,41 @@ class TiagoRobot(Robot):
         point = {"positions": positions, "time_from_start": duration}
         return {"joint_names": list(names), "points": [point]}
 
-    def _frame(self, name: str, camera: CameraTopic) -> CameraFrame:
+    def _open_camera(self, topic: str) -> CameraIntrinsics:
+        """Subscribe to a camera's images, once it has said what it is."""
+        # /top/image_raw/compressed is described by /top/camera_info.
+        about = topic.removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
+        self._ros.subscribe(about, "sensor_msgs/CameraInfo")
+        self._ros.subscribe(topic, "sensor_msgs/CompressedImage")
+        info = self._ros.wait_for(about)
+        self._ros.wait_for(topic)
+        # ROS 1 says K and D, ROS 2 k and d.
+        matrix, distortion = (info[key if key in info else key.lower()] for key in "KD")
+        five = np.zeros(5)
+        five[: len(distortion[:5])] = distortion[:5]
+        return CameraIntrinsics(
+            info["width"], info["height"], np.array(matrix, float).reshape(3, 3), five
+        )
+
+    def _frame(self, name: str, topic: str) -> CameraFrame:
         import cv2
 
-        found = self._ros.newest(camera.topic)
+        found = self._ros.newest(topic)
         if found is None or time.monotonic() - found[1] > _SILENCE_S:
-            raise RobotError(f"camera {name!r} ({camera.topic}) is silent")
+            raise RobotError(f"camera {name!r} ({topic}) is unplugged")
         message, arrived_s, number = found
         try:
             data = np.frombuffer(base64.b64decode(message["data"], validate=True), np.uint8)
             image = cv2.imdecode(data, cv2.IMREAD_COLOR)
         except (binascii.Error, cv2.error):
             image = None
-        wanted = (camera.intrinsics.height, camera.intrinsics.width, 3)
+        wanted = (self.cameras[name].height, self.cameras[name].width, 3)
         if image is None or image.shape != wanted:
             shape = "no image" if image is None else f"{image.shape[1]}x{image.shape[0]} pixels"
             raise RobotError(f"camera {name!r} gives {shape}; {wanted[1]}x{wanted[0]} is wanted")
         return CameraFrame(
             image=cv2.cvtColor(image, cv2.COLOR_BGR2RGB),
-            captured_s=self._stamp_s(camera.topic, message, arrived_s),
+            captured_s=self._stamp_s(topic, message, arrived_s),
             sequence=int(message["header"].get("seq", number)),
         )
 

@@ -7,7 +7,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Mapping
 from importlib.util import find_spec
 
 import numpy as np
@@ -30,25 +29,25 @@ if find_spec("rtde_control") is None:
 
 
 class Ur3Robot(Robot):
-    """A UR3 at an address, its gripper on the same controller, and cameras on this machine."""
+    """A UR3 at an address, its gripper on the same controller, and a camera on this machine."""
 
     def __init__(
         self,
         host: str,
-        cameras: Mapping[str, OpenCvCamera] | None = None,
+        camera: str | None = None,
         control_hz: float = 25.0,
     ) -> None:
         """Prepare; nothing is connected yet.
 
         Args:
             host: address of the controller.
-            cameras: by name.
+            camera: what OpenCV opens as the camera ``top``, for instance ``0``; none if left out.
             control_hz: how often ``command`` will be called.
         """
         arm = get_arm("ur3")
         self.name, self.arm, self.joint_names = "ur3", arm.name, arm.joint_names
         self.control_hz, self.limits = control_hz, joint_limits(arm.name)
-        self._devices = dict(cameras or {})
+        self._devices = {} if camera is None else {"top": OpenCvCamera(camera)}
         self.cameras = {name: device.intrinsics for name, device in self._devices.items()}
         self._gripper = RobotiqGripper(host, arm.gripper_m[1])
         self._link = _Link(host, control_hz)
