@@ -146,7 +146,7 @@ class PretrainConfig:
     """Where the run goes."""
     agent: AgentConfig
     vqvae: VqVaePath = field(default_factory=VqVaePath)
-    updates: int = 20_000
+    updates: int = 60_000
     """Updates of SAC."""
     batch_size: int = 256
     generator_every: int = 4
