@@ -38,8 +38,14 @@ class Ended:
     """One of ``messages.OUTCOMES``, or empty if it was broken off."""
     ticks: int
     distance_m: float
-    """See ``mean_distance_m``, at the end."""
+    """See ``mean_distance_m``, at the end; NaN where there is no goal."""
     subgoals: int
+
+    def __str__(self) -> str:
+        text = f"{self.outcome or 'broken off'} after {self.ticks} ticks"
+        if np.isfinite(self.distance_m):
+            text += f", {self.distance_m:.3f} m to the goal"
+        return text + (f", {self.subgoals} subgoals" if self.subgoals else "")
 
 
 class Session:
@@ -48,6 +54,7 @@ class Session:
     Attributes:
         ticks: the control loop's clock.
         doing: what is going on right now, for people.
+        say: called with each line that people should see.
     """
 
     def __init__(
@@ -65,6 +72,7 @@ class Session:
         self._sent, self._since_s = np.empty(0), 0.0
         self.ticks = Ticks(robot, robot.control_hz)
         self.doing = "standing"
+        self.say: Callable[[str], None] = lambda line: None
         self._goal = np.empty(0)
         self._subgoal: np.ndarray | None = None
         self._subgoals, self._by_human, self._at_ns = 0, False, 0
@@ -143,9 +151,10 @@ class Session:
         return command
 
     def _poll(self, part: int) -> None:
-        self._log.sense()
         # Right after a command there is most time until the next one.
-        if part == 1:
+        looks = part == 1
+        self._log.sense(looks)
+        if looks:
             frames = self._log.frames.items()
             fresh = {name: frame for name, frame in frames if frame.captured_s >= self._since_s}
             self._eyes.look(fresh, self._log.reading)
@@ -193,6 +202,10 @@ class Session:
             self._subgoal, self._subgoals = subgoal.copy(), self._subgoals + 1
             way = mean_distance_m(seen.achieved_goal, subgoal)
             self._log.event("subgoal", at_ns, number=self._subgoals, distance_m=f"{way:.4f}")
+            self.say(
+                f"{step / self._robot.control_hz:6.1f} s: subgoal {self._subgoals}, {way:.3f} m "
+                f"away; the goal is {self._distance_m(seen):.3f} m away"
+            )
         if decision.by_human != self._by_human:
             self._by_human = decision.by_human
             self._log.event(f"intervention_{'start' if self._by_human else 'end'}", at_ns)

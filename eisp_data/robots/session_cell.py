@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from eisp_data.robots.robot import Robot
     from eisp_data.robots.safe_robot import SafeRobot
     from eisp_data.robots.session_view import Eyes
+    from eisp_data.robots.twin.referee import Referee
     from eisp_data.tasks.base import Task
 
 _SLACK_M = 0.03
@@ -62,6 +63,16 @@ class Cell:
     bare: Robot
     """The robot without the safety filter; a twin has its referee there."""
 
+    @property
+    def has_referee(self) -> bool:
+        """Whether somebody knows the truth: of a twin only."""
+        return hasattr(self.bare, "referee")
+
+    @property
+    def referee(self) -> Referee:
+        """The twin's; for whoever sets the table or judges, not for who acts."""
+        return self.bare.referee  # type: ignore[attr-defined]
+
     def eyes(self) -> Eyes:
         """Return what keeps track of the table."""
         from eisp_data.robots.session_view import HandEyes, TaskEyes
@@ -90,9 +101,8 @@ class Cell:
         """
         if self.task is None:
             return np.empty(0, np.float32)
-        referee = getattr(self.bare, "referee", None)
-        if referee is not None:
-            drawn = referee.reset(seed)
+        if self.has_referee:
+            drawn = self.referee.reset(seed)
         else:
             _, drawn = self.task.reset(np.random.default_rng(seed))
         wanted = drawn if goal is None else np.array(goal, np.float32)

@@ -48,6 +48,7 @@ class SessionLog:
         metadata: Mapping[str, str],
         config: McapWriterConfig | None = None,
         joints_role: str | None = None,
+        images: bool = True,
     ) -> None:
         """Create the file.
 
@@ -57,9 +58,10 @@ class SessionLog:
             metadata: describes the session.
             config: of the writer.
             joints_role: what a dataset makes of the joints; None lets the conversion choose.
+            images: whether they are recorded; if not, those that nobody asks for are not taken.
         """
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._robot, self._joints_role = robot, joints_role
+        self._robot, self._joints_role, self._images = robot, joints_role, images
         self._writer = McapWriter(path, config, metadata)
         # Whole microseconds, or rounding would part what has one stamp.
         self._epoch_ns = (self._writer.now_ns() - self._now_ns()) // 1000 * 1000
@@ -67,20 +69,27 @@ class SessionLog:
         self.reading: Reading = robot.observe()
         self.frames: dict[str, CameraFrame] = {}
         self.lost_frames: Counter[str] = Counter()
-        self.seen_frames: Counter[str] = Counter()
         self._log_reading(self.reading)
 
-    def sense(self) -> None:
-        """Take in what is new, and record it; RobotError if joints or cameras do not answer."""
+    def sense(self, looks: bool) -> None:
+        """Take in what is new, and record it; RobotError if joints or cameras do not answer.
+
+        ``looks`` says that images are needed now for more than the record.
+        """
         reading = self._robot.observe()
         if reading.hardware_s > self.reading.hardware_s:
             self.reading = reading
             self._log_reading(reading)
+        if self._images or looks:
+            self._take_images()
+
+    def _take_images(self) -> None:
         for name, frame in self._robot.frames().items():
             before = self.frames.get(name)
-            if before is None or frame.sequence != before.sequence:
-                self.frames[name] = frame
-                self.seen_frames[name] += 1
+            if before is not None and frame.sequence == before.sequence:
+                continue
+            self.frames[name] = frame
+            if self._images:
                 if before is not None:
                     self.lost_frames[name] += max(0, frame.sequence - before.sequence - 1)
                 at = self._stamp(frame.captured_s)

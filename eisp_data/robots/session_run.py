@@ -38,6 +38,10 @@ class Plan:
     pause_s: float
     """Between two episodes a human has so long to set the table, or presses enter before."""
     metadata: dict[str, str]
+    first: int = 0
+    """Number of the first episode, where earlier ones were done before."""
+    images: bool = True
+    """Record the cameras' images."""
 
 
 @dataclass
@@ -58,14 +62,8 @@ class Report:
     """How often the safety filter changed a command, by reason."""
 
     def lines(self) -> list[str]:
-        """Return the report for people."""
+        """Return what is to be said at the end; of each episode it was said when it ended."""
         found = []
-        for number, ended in enumerate(self.episodes):
-            found.append(
-                f"episode {number}: {ended.outcome or 'broken off'} after {ended.ticks} ticks"
-                + (f", {ended.distance_m:.3f} m to the goal" if ended.distance_m >= 0 else "")
-                + (f", {ended.subgoals} subgoals" if ended.subgoals else "")
-            )
         if self.timing is not None:
             scheduled = (
                 "on simulated time"
@@ -89,6 +87,7 @@ def run_session(
     make_controller: Callable[[Cell], Controller],
     report: Report,
     watch: Watch = ignore,
+    after: Callable[[int, Cell, np.ndarray, Ended], None] = lambda number, cell, goal, ended: None,
 ) -> None:
     """Run a session to its end, to Ctrl-C, or to an error.
 
@@ -98,6 +97,7 @@ def run_session(
         make_controller: called once, with the connected cell.
         report: where what happened is noted, also where it ends in an error.
         watch: see ``Session.run_episode``.
+        after: called after each episode with its number, the cell, the goal, and how it ended.
 
     Raises:
         EispError: something failed; the robot stands, the recording is closed and has its index.
@@ -108,7 +108,7 @@ def run_session(
         report.simulated = not runs_by_itself(cell.robot)
         # Whatever takes long is done before anything moves.
         controller = make_controller(cell)
-        goal = cell.set_table(config.seed, config.goal)
+        goal = cell.set_table(config.seed + plan.first, config.goal)
         if not report.simulated:
             report.real_time = stack.enter_context(priority())
         log = stack.enter_context(_recording(cell, plan, report))
@@ -121,9 +121,10 @@ def run_session(
         )
         report.timing = session.ticks.timing()
         status = stack.enter_context(_status(session, report))
+        session.say = status.say
         try:
-            for number in range(plan.episodes):
-                if number:
+            for number in range(plan.first, plan.first + plan.episodes):
+                if number > plan.first:
                     _pause(cell, session, plan, status, stop)
                     goal = cell.set_table(config.seed + number, config.goal)
                 if stop.given:
@@ -134,7 +135,8 @@ def run_session(
                     controller, cell.eyes(), goal, most, config.seed + number, watch
                 )
                 report.episodes.append(ended)
-                status.say(report.lines()[len(report.episodes) - 1])
+                status.say(f"episode {number}: {ended}")
+                after(number, cell, goal, ended)
         finally:
             report.timing = session.ticks.timing()
             report.lost_frames = dict(log.lost_frames)
@@ -144,7 +146,7 @@ def run_session(
 @contextlib.contextmanager
 def _recording(cell: Cell, plan: Plan, report: Report) -> Iterator[SessionLog]:
     role = "extra.joints" if cell.task is not None else None
-    log = SessionLog(cell.robot, plan.output, plan.metadata, joints_role=role)
+    log = SessionLog(cell.robot, plan.output, plan.metadata, joints_role=role, images=plan.images)
     try:
         yield log
     finally:
@@ -156,7 +158,7 @@ def _status(session: Session, report: Report) -> Iterator[Status]:
     def line() -> str:
         timing = session.ticks.timing()
         late = "" if report.simulated else f" | late {timing.late_p99_ms:.1f} ms (99%)"
-        return f"episode {len(report.episodes)}: {session.doing}{late}, {timing.dropped} dropped"
+        return f"{session.doing}{late}, {timing.dropped} dropped"
 
     status = Status(line)
     try:
@@ -167,7 +169,7 @@ def _status(session: Session, report: Report) -> Iterator[Status]:
 
 def _pause(cell: Cell, session: Session, plan: Plan, status: Status, stop: StopSignal) -> None:
     """Wait while a human sets the table; a twin's sets itself."""
-    if hasattr(cell.bare, "referee"):
+    if cell.has_referee:
         return
     status.say(f"set the table, then press enter (it goes on by itself after {plan.pause_s:g} s)")
     session.doing = "waiting for the table to be set"

@@ -1,0 +1,225 @@
+"""A policy on a robot: subgoals, actions, recording, curve and films; on the twin, a verdict."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from eisp_data.config import save_yaml
+from eisp_data.errors import ConfigError, EispError
+from eisp_data.robots.record_controllers import Controller, Decision, Limited, Script, Slowed
+from eisp_data.robots.session import Ended
+from eisp_data.robots.session_cell import Cell
+from eisp_data.robots.session_run import Plan, Report, run_session
+from eisp_data.robots.session_view import Seen
+from eisp_data.tasks.base import SUCCESS_DISTANCE_M, Task
+from eisp_data.tasks.registry import get_task
+from finetune.deploy_config import DeployConfig
+from finetune.deploy_policy import Looking, PolicyController
+from finetune.deploy_trace import distance_curve, read_traces
+from finetune.disturb import Hand
+from finetune.evaluate import share_interval
+from finetune.run import load_for_rollouts
+from pretrain.agent import Agent
+from pretrain.checks import at_least, check_subgoals
+from pretrain.config import SubgoalConfig
+from pretrain.device import set_up
+from pretrain.saved import saved_subgoals
+
+RESULTS, SETTINGS, CURVE = "results.jsonl", "deploy.yaml", "distance.svg"
+_STEP_S = 0.04
+_LOOKS = 2.5
+"""With looks an episode may take so many times as long as the policy's steps alone."""
+_SETTLE_S = 0.5
+
+
+@dataclass
+class _Run:
+    """What the parts of one deployment share."""
+
+    config: DeployConfig
+    task: Task
+    agent: Agent | None
+    report: Report
+    first: int
+    hand: Hand | None = None
+    cell: Cell | None = None
+    lines: list[str] = field(default_factory=list)
+
+    def controller(self, cell: Cell) -> Controller:
+        """Return who decides, once the robot is connected."""
+        self.cell = cell
+        if self.config.interference:
+            self.hand = Hand(cell.referee, self.task)
+        found: Controller
+        if self.agent is None:
+            found = Script(self.task)
+        else:
+            found = PolicyController(self.agent, self.config.device)
+            if self.config.look:
+                found = Looking(found, self.task)
+        limited = Limited(found, self.task.paper.episode_steps)
+        return Slowed(limited, self.task, self.config.ticks_per_step)
+
+    def watch(self, step: int, seen: Seen, decision: Decision) -> None:
+        """Let the hand see each tick."""
+        if self.hand is None:
+            return
+        if step == 0:
+            number = self.first + len(self.report.episodes)
+            self.hand.begin(self.report.goals[-1], self.config.seed + number)
+        self.hand(step, seen, decision)
+
+    def after(self, number: int, cell: Cell, goal: np.ndarray, ended: Ended) -> None:
+        """Note how an episode ended; of a twin, how it really ended."""
+        entry: dict[str, object] = {
+            "episode": number,
+            "seed": self.config.seed + number,
+            "outcome": ended.outcome,
+            "ticks": ended.ticks,
+            "distance_m": round(ended.distance_m, 4),
+            "subgoals": ended.subgoals,
+        }
+        if cell.has_referee and ended.outcome:
+            cell.robot.wait_until(cell.robot.now_s() + _SETTLE_S)
+            entry["success"] = cell.referee.success(goal)
+            entry["settled"] = cell.referee.settled()
+        if self.hand is not None:
+            entry["interfered"] = self.hand.moved
+        if ended.outcome:
+            with (self.config.output_dir / RESULTS).open("a") as file:
+                file.write(json.dumps(entry) + "\n")
+
+
+def deploy(config: DeployConfig) -> None:
+    """Run a policy on a robot, and print what became of it, also if it ended in an error."""
+    task, agent = _prepare(config)
+    first = _done_before(config)
+    name = f"session_{first:04d}.mcap"
+    report = Report(config.output_dir / name)
+    run = _Run(config, task, agent, report, first)
+    config.output_dir.mkdir(parents=True, exist_ok=True)
+    save_yaml(replace(config, resume=False), config.output_dir / SETTINGS)
+    if first >= config.episodes:
+        print("\n".join(_verdict(config)))
+        return
+    try:
+        run_session(config, _plan(run), run.controller, report, run.watch, run.after)
+    finally:
+        print("\n".join(report.lines()))
+        if report.stats is not None:
+            _draw(run)
+    print("\n".join(_verdict(config)))
+
+
+def policy_controller(path: Path | None, task: Task) -> Controller:
+    """Return a policy as ``eisp-record --control policy`` wants it."""
+    if path is None:
+        raise ConfigError("--control policy: missing --policy.path, the folder of a policy")
+    return PolicyController(load_policy(path, task, saved_subgoals(path), "cpu"))
+
+
+def load_policy(path: Path | None, task: Task, subgoals: SubgoalConfig, device: str) -> Agent:
+    """Read a policy for a task; ConfigError if it is one of another task."""
+    agent = load_for_rollouts(path, subgoals, device)
+    if agent.config.task != task.name:
+        raise ConfigError(f"{path} is a policy of {agent.config.task!r}, not of {task.name!r}")
+    return agent
+
+
+def _prepare(config: DeployConfig) -> tuple[Task, Agent | None]:
+    """Return task and policy; whatever is wrong with them is said before anything is connected."""
+    at_least(
+        1,
+        {
+            "--episodes": config.episodes,
+            "--ticks-per-step": config.ticks_per_step,
+            "--threads": config.threads,
+        },
+    )
+    if config.task is None:
+        raise ConfigError("missing --task")
+    task = get_task(config.task)
+    if config.interference and config.robot != "twin":
+        raise ConfigError(f"--interference: only the twin has such a hand, not {config.robot}")
+    if config.control == "script":
+        return task, None
+    check_subgoals(config.subgoals, "--subgoals")
+    device = set_up(config.device, config.threads)
+    return task, load_policy(config.policy.path, task, config.subgoals, device)
+
+
+def _done_before(config: DeployConfig) -> int:
+    """Return how many episodes the output folder has."""
+    results = config.output_dir / RESULTS
+    if config.output_dir.exists() and any(config.output_dir.iterdir()) and not config.resume:
+        raise ConfigError(
+            f"{config.output_dir} is not empty; add --resume to go on with it, or choose another "
+            "--output-dir"
+        )
+    return len(results.read_text().splitlines()) if results.exists() else 0
+
+
+def _plan(run: _Run) -> Plan:
+    config, task = run.config, run.task
+    steps = task.paper.episode_steps * config.ticks_per_step * (_LOOKS if config.look else 1.0)
+    metadata = {
+        "robot": config.robot,
+        "control": config.control,
+        "task": task.name,
+        "instruction": task.instruction,
+    }
+    return Plan(
+        run.report.output,
+        config.episodes - run.first,
+        _STEP_S * steps,
+        config.pause_s,
+        metadata,
+        run.first,
+        config.record_images,
+    )
+
+
+def _draw(run: _Run) -> None:
+    """Draw the distance curve and the films of what was recorded."""
+    from eisp_data.robots.pose import View
+    from finetune.deploy_film import film
+
+    config, cell = run.config, run.cell
+    traces = read_traces(run.report.output)
+    if not traces or cell is None:
+        return
+    curve = config.output_dir / CURVE
+    curve.write_text(distance_curve(traces, SUCCESS_DISTANCE_M))
+    print(f"{curve}: distance to the goal over time")
+    if not config.record_images or cell.camera is None:
+        return
+    placed = cell.calibration
+    view = View(placed.cameras[cell.camera], placed.transform_base_to_task)
+    for number, trace in enumerate(traces, start=run.first):
+        to = config.output_dir / f"episode_{number:04d}.mp4"
+        if film(run.report.output, trace, cell.camera, view, run.task, to):
+            print(f"{to}: the camera's view with subgoals and goal")
+
+
+def _verdict(config: DeployConfig) -> list[str]:
+    """Return the share of episodes that really succeeded, with its 95% interval."""
+    path = config.output_dir / RESULTS
+    if not path.exists():
+        return []
+    try:
+        entries = [json.loads(line) for line in path.read_text().splitlines()]
+        judged = [entry for entry in entries if "success" in entry]
+        hits = np.array([entry["success"] for entry in judged], bool)
+        moved = sum(entry.get("interfered", False) for entry in judged)
+    except (ValueError, TypeError, KeyError):
+        raise EispError(f"{path} holds no results that can be read") from None
+    if not judged:
+        return []
+    lines = [f"success, by the twin's referee: {share_interval(hits)} of {len(hits)} episodes"]
+    if config.interference:
+        lines.append(f"a hand took a block away in {moved} of them")
+    return lines
