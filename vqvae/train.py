@@ -42,7 +42,7 @@ def train(config: VqVaeTrainConfig) -> tuple[Path, Quality]:
     rng = np.random.default_rng(config.seed)
     model = VqVae(config.model)
     model.set_moments(*moments(images[spread(train_rows, _MOMENT_IMAGES)]))
-    model.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    model.to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=config.lr, fused=True)
     begin_run(run, config, CONFIG_FILE)
     vision = VisionConfig(arrays.spec.task, config.dataset.camera, config.model)

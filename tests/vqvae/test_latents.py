@@ -1,0 +1,50 @@
+"""Codes are computed once for a dataset and a VQ-VAE, and never served for another."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from eisp_data.errors import DataError
+from eisp_data.storage.cache import load_arrays, load_images
+from vqvae import latents
+from vqvae.saved import load
+
+
+def test_codes_are_computed_once_and_mapped(images, vqvae_run, monkeypatch):
+    model, vision = load(vqvae_run)
+    first = latents.load_codes(images, model, vision.camera)
+    monkeypatch.setattr(latents, "encode", lambda *_: pytest.fail("computed again"))
+    again = latents.load_codes(images, model, vision.camera)
+    assert isinstance(again, np.memmap) and np.array_equal(first, again)
+
+
+def test_other_weights_are_other_codes(images, vqvae_run):
+    model, vision = load(vqvae_run)
+    first = np.array(latents.load_codes(images, model, vision.camera))
+    model.encoder[0].weight.data *= -1.0
+    other = latents.load_codes(images, model, vision.camera)
+    assert np.array_equal(other, latents.encode(model, load_images(images, vision.camera)))
+    assert not np.array_equal(first, other)
+
+
+def test_an_image_task_sees_the_robot_and_latents_and_no_object(images, vqvae_run):
+    model, vision = load(vqvae_run)
+    seen, states = latents.load_latent_arrays(images, model, vision), load_arrays(images)
+    codes = latents.load_codes(images, model, vision.camera)
+    assert seen.spec.task == "open_drawer_image"
+    assert (seen.spec.observation_dim, seen.spec.goal_dim) == (10 + 108, 108)
+    assert np.array_equal(seen.observation[:, :10], states.observation[:, :10])
+    assert np.array_equal(seen.observation[:, 10:], latents.embed(model, codes))
+    assert np.array_equal(seen.achieved_goal, latents.embed(model, codes))
+    assert seen.desired_goal.shape == (4, 108)
+    for name in ("action", "reward", "success", "episode_start"):
+        assert np.array_equal(getattr(seen, name), getattr(states, name))
+
+
+def test_a_dataset_of_another_task_is_refused(images, vqvae_run):
+    model, vision = load(vqvae_run)
+    with pytest.raises(DataError, match="of 'open_drawer', the VQ-VAE was trained on 'store'"):
+        latents.load_latent_arrays(images, model, replace(vision, task="store"))

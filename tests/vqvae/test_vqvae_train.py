@@ -1,0 +1,154 @@
+"""A tiny VQ-VAE learns, survives interruption bit for bit, and says what it cannot use."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from image_samples import TINY, tiny_training
+
+from eisp_data.errors import ConfigError, DataError
+from vqvae import cli, saved
+from vqvae import train as training
+from vqvae.config import VqVaeTrainConfig
+from vqvae.presets import preset
+
+
+def entries(run: Path) -> list[dict[str, float]]:
+    lines = (run / "metrics.jsonl").read_text().splitlines()
+    return [
+        {k: v for k, v in json.loads(line).items() if k not in ("wall_s", "stage")}
+        for line in lines
+    ]
+
+
+def test_a_tiny_one_learns_to_reconstruct_and_uses_its_codes(vqvae_run):
+    first, *_, last = entries(vqvae_run)
+    # In units of the pixels' variance: the mean image would be 1.
+    assert last["train/reconstruction"] < 0.5 < first["train/reconstruction"]
+    assert last["held_out/psnr_db"] > first["held_out/psnr_db"] > 10
+    assert last["held_out/used"] > 0.5
+
+
+def test_what_was_saved_comes_back_the_same(vqvae_run, tmp_path):
+    model, vision = saved.load(vqvae_run)
+    assert (vision.task, vision.camera, vision.model) == ("open_drawer", "shoulder", TINY)
+    saved.save(model, vision, tmp_path / "again")
+    again, same = saved.load(tmp_path / "again")
+    assert same == vision and again.fingerprint() == model.fingerprint()
+    files = {p.name for p in (vqvae_run / "checkpoints/last/").rglob("*") if p.is_file()}
+    assert files == {"config.json", "model.safetensors", "state.json", "state.safetensors"}
+
+
+class Cut(Exception):
+    """Stands for a kill."""
+
+
+def test_an_interrupted_run_ends_as_one_that_was_not(images, vqvae_run, tmp_path, monkeypatch):
+    config = tiny_training(images, tmp_path / "run")
+    done = iter(range(10**6))
+
+    def step(*args: object, **options: object):
+        if next(done) == 30:
+            raise Cut
+        return real(*args, **options)
+
+    real = training.step
+    with monkeypatch.context() as patch:
+        patch.setattr(training, "step", step)
+        with pytest.raises(Cut):
+            training.train(config)
+    training.train(replace(config, resume=True))
+    assert entries(tmp_path / "run") == entries(vqvae_run)
+    whole, resumed = saved.load(vqvae_run)[0], saved.load(tmp_path / "run")[0]
+    assert resumed.fingerprint() == whole.fingerprint()
+
+
+def test_a_finished_run_can_be_resumed(images, vqvae_run):
+    _, quality = training.train(tiny_training(images, vqvae_run, resume=True))
+    assert quality.psnr_db == pytest.approx(entries(vqvae_run)[-1]["held_out/psnr_db"], abs=1e-3)
+
+
+def test_the_papers_preset_is_the_papers():
+    config = preset("paper", Path("data"), Path("runs"))
+    assert (config.lr, config.batch_size, config.updates) == (1e-4, 256, 1_000_000)
+    assert config.final_lr_share == 1.0 and config.model.image_size == (48, 48)
+    assert config.model.latent_channels == 3
+
+
+def test_the_learning_rate_falls_to_its_share():
+    config = replace(preset("cpu", Path("d"), Path("r")), updates=100, lr=1.0, final_lr_share=0.1)
+    rates = [training.learning_rate(config, update) for update in (0, 50, 100)]
+    assert rates == pytest.approx([1.0, 0.55, 0.1])
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"batch_size": 0}, "--batch-size must be at least 1; got 0"),
+        ({"validation_share": 1.0}, "--validation-share must be between 0 and 1; got 1.0"),
+        ({"model": replace(TINY, image_size=(48, 50))}, "multiples of 8; got 48 x 50"),
+        ({"model": replace(TINY, codes=0)}, "--model.codes must be at least 1; got 0"),
+    ],
+)
+def test_a_setting_that_cannot_be_used_is_named(tmp_path, changes, said):
+    with pytest.raises(ConfigError, match=said):
+        training.train(tiny_training(tmp_path / "data", tmp_path / "run", **changes))
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_dataset_without_images_or_of_another_size_is_refused(images, tmp_path):
+    def said(config: VqVaeTrainConfig) -> str:
+        with pytest.raises(DataError) as caught:
+            training.train(config)
+        assert not config.output_dir.exists()
+        return str(caught.value)
+
+    states = images.parent / "states"
+    assert "no images of camera 'shoulder'" in said(tiny_training(states, tmp_path / "run"))
+    larger = replace(TINY, image_size=(64, 64))
+    assert "are 48 x 48; the VQ-VAE takes 64 x 64" in said(
+        tiny_training(images, tmp_path / "run", model=larger)
+    )
+
+
+def test_the_command_trains_and_evaluates(images, tmp_path, monkeypatch, capsys):
+    def run(*words: object) -> str:
+        monkeypatch.setattr(sys, "argv", ["eisp-vqvae", *map(str, words)])
+        cli.main()
+        return capsys.readouterr().out
+
+    small = ["--updates", 3, "--batch-size", 4, "--model.channels", 4, 4, "--model.codes", 8]
+    place = ["--dataset.root", images, "--output-dir", tmp_path / "run", "--threads", 1]
+    said = run("train", *place, *small, "--validation-share", 0.25, "--device", "cpu")
+    assert "PSNR" in said and f"model: {tmp_path / 'run/checkpoints/last'}" in said
+    table = run("evaluate", tmp_path / "run")
+    assert "block by linear probe" in table and "handle by linear probe" in table
+    assert "codes changed by video" in table
+    figures = json.loads(run("evaluate", tmp_path / "run", "--json"))
+    assert 0 <= figures["changed_by_video"] <= 1 and 0 < figures["quality"]["used"] <= 1
+    monkeypatch.setattr(sys, "argv", ["eisp-vqvae", "train", *map(str, place)])
+    with pytest.raises(SystemExit):
+        cli.main()
+    assert "is not empty; add --resume" in capsys.readouterr().err
+
+
+def test_a_folder_that_holds_no_vqvae_is_named(tmp_path):
+    with pytest.raises(DataError, match="holds no VQ-VAE"):
+        saved.load(tmp_path)
+    (tmp_path / "model.safetensors").write_bytes(b"x")
+    (tmp_path / "config.json").write_text('{"agent": {}}')
+    with pytest.raises(DataError, match="holds a policy, not a VQ-VAE"):
+        saved.load(tmp_path)
+
+
+def test_moments_are_those_of_the_pixels():
+    pixels = np.random.default_rng(0).integers(0, 256, (7, 8, 8, 3), np.uint8)
+    mean, std = training.moments(pixels)
+    assert torch.allclose(mean, torch.from_numpy(pixels / 255.0).float().mean((0, 1, 2)), atol=1e-5)
+    assert np.allclose(std.numpy(), (pixels / 255.0).std((0, 1, 2)), atol=1e-5)
