@@ -74,15 +74,20 @@ def _flat(axes: np.ndarray) -> np.ndarray:
     return axes / np.linalg.norm(axes, axis=1, keepdims=True)
 
 
-def drag_drawer(opening_m: float, tool: np.ndarray) -> float:
-    """Return how far the drawer is open when closed fingers are where they are.
+def drag_drawer(opening_m: float, before: np.ndarray, tool: np.ndarray) -> float:
+    """Return how far the drawer is open after closed fingers have come where they are.
 
-    Fingers between the bar and the front keep to that gap.
+    Fingers between the bar and the front keep to that gap, and take it along.
+
+    Args:
+        opening_m: before.
+        before: (4, 4), the tool's pose to the task then.
+        tool: (4, 4), the same now.
     """
     x, y, z = tool[:3, 3]
     low = z - _FINGER_BELOW_M < _BAR_TOP_M and abs(y) < _BAR_HALF_WIDTH_M
     bar = HANDLE_CLOSED_M[0] - opening_m
-    if not low or not bar < x < bar + HANDLE_GAP_M:
+    if not low or not bar < before[0, 3] < bar + HANDLE_GAP_M:
         return opening_m
     least = HANDLE_CLOSED_M[0] + BAR_HALF_M - (x - _FINGER_HALF_M[0])
     most = HANDLE_CLOSED_M[0] + HANDLE_GAP_M - (x + _FINGER_HALF_M[0])

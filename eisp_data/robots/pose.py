@@ -25,7 +25,7 @@ _CONVERGED = 1e-5
 """rad and m."""
 _MOST_PX = 2.0
 """A fit with a larger error is none."""
-_GOOD_PX = 0.6
+_GOOD_PX = 0.35
 """A guess that leads to a fit so good needs no rival."""
 _STARTS = 2
 """How many markers, the largest first, are asked for a pose to start from."""
@@ -268,9 +268,13 @@ def _weights(residual: np.ndarray) -> np.ndarray:
 
 
 def _error_px(residual: np.ndarray) -> float:
-    """Return the error of the better three quarters of the corners."""
+    """Return the error of the better three quarters of the corners; of all, if there are four.
+
+    Three corners fit a pose whatever they are.
+    """
     square = np.sort((residual**2).sum(axis=-1))
-    return float(np.sqrt(square[: max(3, 3 * len(square) // 4)].mean()))
+    count = len(square) if len(square) == 4 else 3 * len(square) // 4
+    return float(np.sqrt(square[:count].mean()))
 
 
 def _turn(vector: np.ndarray) -> np.ndarray:

@@ -35,6 +35,9 @@ class ToolHistory:
         self._kinematics, self._to_task = kinematics, transform_base_to_task
         self._states: deque[ToolState] = deque(maxlen=_KEPT)
 
+    def __len__(self) -> int:
+        return len(self._states)
+
     @property
     def newest(self) -> ToolState:
         """The state of the last reading."""

@@ -14,13 +14,15 @@ from eisp_data.robots.kinematics import kinematics
 from eisp_data.robots.markers import marked_objects
 from eisp_data.robots.pose import PoseFit, Priors, View, fit_pose, fit_slide
 from eisp_data.robots.robot import CameraFrame, Reading
-from eisp_data.robots.tool_history import ToolHistory
+from eisp_data.robots.tool_history import ToolHistory, ToolState
 from eisp_data.robots.tracks import HALF_M, BlockTrack, DrawerTrack
 from eisp_data.sim.drawer import TRAY_CENTRE_M
 from eisp_data.tasks.base import Task
 
 _TILT_STD, _HEIGHT_STD_M = 0.01, 0.0007
 """Of a block that stands on something."""
+_UPRIGHT_PX = 0.5
+"""A block that fits worse than this standing upright does not."""
 _ANY_TILT_STD = 0.5
 """Of one that does not: it only says which of two mirror images it is."""
 _HELD_TILT_STD = 0.1
@@ -62,17 +64,17 @@ class Tracker:
 
     def update(self, reading: Reading, frame: CameraFrame | None = None) -> Estimates:
         """Take in a reading and, if it is a new one, an image; return what is believed now."""
+        before = self._tools.newest.transform_tool_to_task if self._tools else None
         tool = self._tools.add(reading)
+        if before is None:
+            before = tool.transform_tool_to_task
         if frame is not None and frame.sequence != self._sequence:
             self._sequence = frame.sequence
             self._see(frame)
-        before = None if self._drawer is None else self._drawer.opening_m
         if self._drawer is not None:
-            self._drawer.follow(tool)
+            self._follow_drawer(self._drawer, before, tool)
         for name, block in self._blocks.items():
-            if self._drawer is not None and before is not None and self._in_tray(block.pose):
-                block.shift((self._drawer.opening_m or 0.0 - before) * _OPENS)
-            block.follow(tool, self._standing_height(name))
+            block.follow(before, tool, self._standing_height(name))
         return self.estimates()
 
     def estimates(self) -> Estimates:
@@ -141,11 +143,20 @@ class Tracker:
             guess = self._drawer.opening_m or 0.0
             slid = fit_slide(self._view, self._marked["drawer"], rays, _OPENS, guess)
             if slid is not None:
-                self._drawer.see(slid[0], frame.captured_s, since)
+                self._drawer.see(slid[0], frame.captured_s, then, since)
         for name, block in self._blocks.items():
             fit = self._fit_block(name, block, rays, then)
             if fit is not None:
                 block.see(fit, frame.captured_s, then, since)
+
+    def _follow_drawer(self, drawer: DrawerTrack, before: np.ndarray, tool: ToolState) -> None:
+        """Let the drawer follow the fingers, and what lies in it follow the drawer."""
+        inside = [block for block in self._blocks.values() if self._in_tray(block.pose)]
+        was = drawer.opening_m
+        drawer.follow(before, tool)
+        if drawer.opening_m is not None and was is not None:
+            for block in inside:
+                block.shift((drawer.opening_m - was) * _OPENS)
 
     def _fit_block(
         self, name: str, block: BlockTrack, rays: dict[int, np.ndarray], tool_then: np.ndarray
@@ -154,9 +165,9 @@ class Tracker:
         item, guess = self._marked[name], block.expected(tool_then)
         if block.held and guess is not None:
             return fit_pose(self._view, item, rays, guess, Priors(_HELD_TILT_STD))
-        fit = fit_pose(self._view, item, rays, guess, Priors(_ANY_TILT_STD))
-        if fit is None:
-            return None
+        fit = fit_pose(self._view, item, rays, guess, Priors(_TILT_STD))
+        if fit is None or fit.error_px > _UPRIGHT_PX:
+            return fit_pose(self._view, item, rays, guess, Priors(_ANY_TILT_STD))
         pose = fit.transform_object_to_task
         slack = max(_STANDS_M, _STANDS_STD * fit.position_std_m)
         heights = [height + HALF_M for height in self._surfaces(name, pose)]
@@ -165,8 +176,7 @@ class Tracker:
             return fit
         priors = Priors(_TILT_STD, height, _HEIGHT_STD_M)
         standing = fit_pose(self._view, item, rays, pose, priors)
-        tipped = standing is None or standing.error_px > 2 * fit.error_px + 0.3
-        return fit if tipped else standing
+        return fit if standing is None or standing.error_px > _UPRIGHT_PX else standing
 
     def _surfaces(self, name: str, pose: np.ndarray) -> list[float]:
         """Return the heights (m) of all that a block may stand on where it is."""

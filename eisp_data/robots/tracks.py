@@ -22,8 +22,8 @@ image has to say the same."""
 _AGREE_M = 0.012
 _GRASP_LOW_M, _GRASP_HIGH_M = 0.040, 0.057
 """Openings at which the fingers may hold a block."""
-_OPENING_M = 0.0005
-"""Fingers that move apart by more from one reading to the next do not grasp."""
+_OPENING_M_S = 0.0125
+"""Fingers that move apart faster do not grasp."""
 _BETWEEN_M = np.array([0.030, 0.020, 0.032])
 """How far off the middle of the fingers a held block may be."""
 _GRASP_STD_M, _SLIP_STD_M = 0.002, 0.0003
@@ -53,7 +53,6 @@ class BlockTrack:
         self._seen: np.ndarray | None = None
         self._elsewhere: np.ndarray | None = None
         self._contradictions = 0
-        self._tool: ToolState | None = None
 
     @property
     def held(self) -> bool:
@@ -98,15 +97,15 @@ class BlockTrack:
             self._push(before, tool)
             before = tool.transform_tool_to_task
 
-    def follow(self, tool: ToolState, standing_m: float) -> None:
+    def follow(self, before: np.ndarray, tool: ToolState, standing_m: float) -> None:
         """Go on to the tool's newest state: held, pushed, let go of or left alone.
 
         Args:
-            tool: the state.
+            before: (4, 4), the tool's pose at the state before.
+            tool: the newest state.
             standing_m: height at which the block would stand where it is.
         """
-        before, self._tool = self._tool, tool
-        if self.pose is None or before is None:
+        if self.pose is None:
             return
         if self._grasp is not None:
             if not _GRASP_LOW_M < tool.opening_m < _GRASP_HIGH_M:
@@ -117,11 +116,11 @@ class BlockTrack:
                 self.velocity = tool.velocity + np.cross(tool.spin, arm)
                 self.spin = tool.spin
             return
-        self._push(before.transform_tool_to_task, tool)
+        self._push(before, tool)
         if tool.time_s - self.seen_s > 0.1:
             self.velocity, self.spin = np.zeros(3), np.zeros(3)
-        closing = tool.opening_m < before.opening_m + _OPENING_M
-        if closing and _GRASP_LOW_M < tool.opening_m < _GRASP_HIGH_M:
+        grasping = _GRASP_LOW_M < tool.opening_m < _GRASP_HIGH_M
+        if grasping and tool.opening_speed_m_s < _OPENING_M_S:
             self._grasp_if_between(tool)
 
     def shift(self, way: np.ndarray) -> None:
@@ -216,8 +215,10 @@ class DrawerTrack:
         self.seen_s = -np.inf
         self._seen_m: float | None = None
 
-    def see(self, opening_m: float, captured_s: float, tools: list[ToolState]) -> None:
-        """Take in what an image shows; ``tools`` are the tool's states since then."""
+    def see(
+        self, opening_m: float, captured_s: float, tool_then: np.ndarray, tools: list[ToolState]
+    ) -> None:
+        """Take in what an image shows; the rest as in ``BlockTrack.see``."""
         passed = captured_s - self.seen_s
         self.speed_m_s = 0.0
         if self._seen_m is not None and 0 < passed < 0.2:
@@ -226,9 +227,10 @@ class DrawerTrack:
         self.seen_s, self._seen_m = captured_s, opening_m
         self.opening_m = opening_m
         for tool in tools:
-            self.follow(tool)
+            self.follow(tool_then, tool)
+            tool_then = tool.transform_tool_to_task
 
-    def follow(self, tool: ToolState) -> None:
-        """Go on to the tool's newest state."""
+    def follow(self, before: np.ndarray, tool: ToolState) -> None:
+        """Go on to the tool's newest state from when it was at (4, 4)."""
         if self.opening_m is not None:
-            self.opening_m = drag_drawer(self.opening_m, tool.transform_tool_to_task)
+            self.opening_m = drag_drawer(self.opening_m, before, tool.transform_tool_to_task)

@@ -39,7 +39,8 @@ def cell_spec(task: Task) -> mujoco.MjSpec:
     _mark(spec, task)
     spec.option.timestep = TIMESTEP_S
     # The light of the scene leaves the faces that the camera sees in the dark.
-    spec.visual.headlight.diffuse = [0.45, 0.45, 0.45]
+    spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.4] * 3, [0.55] * 3
+    spec.lights[0].diffuse = [0.2] * 3
     # Each would take three times as long as all the rest of a picture.
     spec.visual.quality.shadowsize = 0
     spec.visual.quality.offsamples = 0
