@@ -44,8 +44,8 @@ class Agent(nn.Module):
         super().__init__()
         if not layout.objects and "objects" in (config.features, _NEEDS.get(config.generator)):
             raise ConfigError(
-                f"{config.task}: its goal is not made of objects; "
-                "choose --agent.features plain --agent.generator hybrid"
+                f"{config.task}: observation and goal are not made of objects as the simulated "
+                "tasks' are; choose --agent.features plain --agent.generator hybrid"
             )
         self.config, self.layout = config, layout
         features: nn.Module = (

@@ -134,11 +134,15 @@ def load_trajectories(
 
 
 def layout_of(arrays: DatasetArrays) -> Layout:
-    """Return the layout of a dataset's environment."""
-    if arrays.spec.task in TASKS:
-        return Layout.of(TASKS[arrays.spec.task])
+    """Return the layout of a dataset's environment.
+
+    A recording of a robot may be of a task of ours and yet have an observation of its own.
+    """
     spec = arrays.spec
-    return Layout(spec.observation_dim, spec.goal_dim, spec.action_dim)
+    plain = Layout(spec.observation_dim, spec.goal_dim, spec.action_dim)
+    known = Layout.of(TASKS[spec.task]) if spec.task in TASKS else plain
+    sizes = known.observation_dim, known.goal_dim, known.action_dim
+    return known if sizes == (spec.observation_dim, spec.goal_dim, spec.action_dim) else plain
 
 
 def gather(
