@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import socket
+import subprocess
 import sys
 
 import numpy as np
@@ -211,6 +213,21 @@ def test_view_draws_a_storyboard_and_a_film(eisp_data, simulated, tmp_path, draw
     assert status == 2 and "no episode 2; there are 0 to 1" in err
 
 
+def test_view_writes_a_rerun_recording_that_rerun_opens(eisp_data, make_dataset, tmp_path):
+    pytest.importorskip("rerun", reason="the extra 'view' is not installed")
+    root, _ = make_dataset(cameras=True, sim_state_dim=0)
+    status, out, _ = eisp_data("view", root, "--to", tmp_path / "look", "--rerun")
+    assert status == 0 and len(out.splitlines()) == 3
+    said = subprocess.run(
+        [sys.executable, "-m", "rerun", "rrd", "stats", str(tmp_path / "look/episode-0.rrd")],
+        env={**os.environ, "HOME": str(tmp_path)},
+        capture_output=True,
+        text=True,
+    ).stdout
+    for path in ("camera", "achieved_goal", "desired_goal", "action", "reward"):
+        assert f"/{path}: " in said, said
+
+
 def test_view_shows_the_camera_of_a_real_robot(eisp_data, make_dataset, tmp_path):
     root, _ = make_dataset(cameras=True, sim_state_dim=0)
     assert eisp_data("view", root, "--to", tmp_path / "look")[0] == 0
@@ -223,17 +240,29 @@ def test_the_subgoal_is_the_end_of_the_part_that_a_step_is_in():
     assert waypoints(2, 1).tolist() == [2, 2, 2]
 
 
-def test_collecting_checking_and_loading_need_no_network(tmp_path, monkeypatch, eisp_data):
+def test_collecting_checking_and_training_need_no_network(tmp_path, monkeypatch, eisp_data):
+    from learning_samples import tiny_pretraining
+
     from eisp_data.cli.collect import CollectConfig, collect
+    from pretrain.train import pretrain
 
-    def refuse(*_args, **_kwargs):
-        raise AssertionError("the network was used")
+    tried = []
 
-    monkeypatch.setattr(socket.socket, "connect", refuse)
-    monkeypatch.setattr(socket, "getaddrinfo", refuse)
+    def refuse(*words, **_options):
+        tried.append(words)
+        raise OSError("the network is off")
+
+    for name in ("connect", "connect_ex", "sendto", "bind"):
+        monkeypatch.setattr(socket.socket, name, refuse)
+    for name in ("getaddrinfo", "create_connection", "gethostbyname"):
+        monkeypatch.setattr(socket, name, refuse)
     root = tmp_path / "stack"
     collect(CollectConfig(output_dir=root, task="stack", policy="oracle", episodes=2, workers=1))
     assert eisp_data("validate", root)[0] == 0
     arrays = load_arrays(root)
     assert arrays.num_episodes == 2
     assert arrays.num_steps == sum(map(len, read_episodes(root)))
+    config = tiny_pretraining(root, tmp_path / "run", updates=2, validate_every=2)
+    run = pretrain(config)
+    assert (run / "checkpoints/last/pretrained_model/model.safetensors").is_file()
+    assert tried == []
