@@ -137,7 +137,8 @@ class SafetyFilter:
 
     def allows(self, joint_position: np.ndarray) -> bool:
         """Whether the arm may stand at (J,) rad: within limits and workspace, and clear."""
-        outside = self._outside(joint_position, self._tool_in_task(joint_position))
+        path = joint_position[None]
+        outside = self._outside(path, self._tool_in_task(path))[0]
         return outside <= 0.0 and (self._is_clear is None or self._is_clear(joint_position))
 
     @property
@@ -189,19 +190,19 @@ class SafetyFilter:
     def _way_to_stop(self, velocity: np.ndarray) -> list[np.ndarray] | None:
         """Return the targets from one step at that velocity to rest, None if any is not allowed."""
         velocities = self._braking_velocities(velocity)
-        way = list(self._position + self.period_s * np.cumsum(velocities, axis=0))
-        place = self._tool_in_task(self._position)
-        worst = max(0.0, self._outside(self._position, place))
-        longest = self.config.tool_speed_m_s * self.period_s
-        for target in way:
-            to = self._tool_in_task(target)
-            outside = self._outside(target, to)
-            step = to - place
-            if outside > worst + _TINY or step.dot(step) > longest**2 + _TINY:
-                return None
-            worst, place = min(worst, max(0.0, outside)), to
-        if not self._within_effort(way, velocities):
+        path = self._position + self.period_s * np.cumsum(velocities, axis=0)
+        path = np.concatenate([self._position[None], path])
+        places = self._tool_in_task(path)
+        outside = self._outside(path, places)
+        # Where it is outside now, it has to come nearer with each step.
+        if (outside[1:] > np.maximum(outside[:-1], 0.0) + _TINY).any():
             return None
+        longest = self.config.tool_speed_m_s * self.period_s
+        if (np.square(np.diff(places, axis=0)).sum(axis=1) > longest**2 + _TINY).any():
+            return None
+        if not self._within_effort(path, velocities):
+            return None
+        way = list(path[1:])
         return way if self._is_clear is None or self._stays_clear(way) else None
 
     def _braking_velocities(self, velocity: np.ndarray) -> np.ndarray:
@@ -210,30 +211,26 @@ class SafetyFilter:
         steps = np.arange(max(1, int(np.ceil(fastest))))
         return np.outer(1.0 - steps / max(fastest, 1.0), velocity)
 
-    def _outside(self, joint_position: np.ndarray, tool: np.ndarray) -> float:
-        """Return how far outside joint limits (rad) and workspace (m) that is; <= 0 within."""
+    def _outside(self, path: np.ndarray, places: np.ndarray) -> np.ndarray:
+        """Return how far (N, J) rad and (N, 3) m are outside the limits, (N,); <= 0 within."""
         limits = self.limits
-        return max(
-            float((joint_position - limits.position_high).max()),
-            float((limits.position_low - joint_position).max()),
-            float((tool - self._high).max()),
-            float((self._low - tool).max()),
-        )
+        joints = np.maximum(path - limits.position_high, limits.position_low - path)
+        tool = np.maximum(places - self._high, self._low - places)
+        return np.maximum(joints.max(axis=1), tool.max(axis=1))
 
-    def _within_effort(self, way: list[np.ndarray], velocities: np.ndarray) -> bool:
+    def _within_effort(self, path: np.ndarray, velocities: np.ndarray) -> bool:
         """Whether the torques of the whole way, from this step to rest, are within the limits."""
-        before = self._moving
-        still = np.zeros_like(before)
+        still = np.zeros_like(self._moving)
         # What standing here takes already is no reason not to leave.
         standing = pin.rnea(self._model, self._data, self._position, still, still)
         bound = np.maximum(self._effort, np.abs(standing)) + _TINY
-        for position, velocity in zip([self._position, *way], [*velocities, still], strict=True):
-            acceleration = (velocity - before) / self.period_s
-            torque = pin.rnea(self._model, self._data, position, velocity, acceleration)
-            if (np.abs(torque) > bound).any():
-                return False
-            before = velocity
-        return True
+        speeds = [*velocities, still]
+        changes = np.diff([self._moving, *speeds], axis=0) / self.period_s
+        torques = [
+            pin.rnea(self._model, self._data, position, speed, change)
+            for position, speed, change in zip(path, speeds, changes, strict=True)
+        ]
+        return bool((np.abs(torques) <= bound).all())
 
     def _stays_clear(self, way: list[np.ndarray]) -> bool:
         """Whether the way is free of collisions; out of one that the arm is in, any way is."""
@@ -241,9 +238,13 @@ class SafetyFilter:
         ends = way if len(way) == 1 else [way[0], way[-1]]
         return all(map(self._is_clear, ends)) or not self._is_clear(self._position)
 
-    def _tool_in_task(self, joint_position: np.ndarray) -> np.ndarray:
-        pin.forwardKinematics(self._model, self._data, joint_position)
-        return self._rotation.T @ (self._data.oMi[self._joint].act(self._tool) - self._origin)
+    def _tool_in_task(self, path: np.ndarray) -> np.ndarray:
+        """Return (N, 3) m for (N, J) rad."""
+        places = np.empty((len(path), 3))
+        for place, joint_position in zip(places, path, strict=True):
+            pin.forwardKinematics(self._model, self._data, joint_position)
+            place[:] = self._data.oMi[self._joint].act(self._tool)
+        return (places - self._origin) @ self._rotation
 
     def _gripper(self, wanted: float) -> float:
         """Return the opening in m after one period towards the wanted one."""

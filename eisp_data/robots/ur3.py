@@ -20,7 +20,7 @@ from eisp_data.robots.robot import CameraFrame, JointCommand, Reading, Robot
 from eisp_data.robots.robotiq import RobotiqGripper
 
 _CONNECT_S = 15.0
-_SILENCE_S = 0.25
+_SILENCE_S = 0.5
 """States come every 8 ms; after this long without one the connection is lost."""
 _GOODBYE_S = 2.0
 

@@ -204,7 +204,8 @@ class UrController:
             if command == SERVO_STOP:
                 self._target = None
             if command == SET_WATCHDOG:
-                self._patience = 1.0 / self._registers["input_double_register_0"]
+                # Five times that of a real one: a machine that runs tests may be slow.
+                self._patience = 5.0 / self._registers["input_double_register_0"]
             if command == STOP_SCRIPT:
                 self._program_running, self._target = False, None
             self._state = DONE
