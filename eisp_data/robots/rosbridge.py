@@ -15,6 +15,8 @@ from eisp_data.errors import RobotError
 
 PORT = 9090
 _TIMEOUT_S = 5.0
+_LARGEST = 2**25
+"""Bytes of a message: an image has room."""
 
 
 class Rosbridge:
@@ -24,13 +26,15 @@ class Rosbridge:
         """Prepare for a rosbridge server at ``host`` or ``host:port``."""
         self.host = host if ":" in host else f"{host}:{PORT}"
         self._link: ClientConnection | None = None
+        self._opened = contextlib.ExitStack()
         self._newest: dict[str, tuple[dict[str, Any], float, int]] = {}
         self._fault: str | None = None
 
     def connect(self) -> None:
         """Connect; RobotError if nothing answers."""
         try:
-            self._link = connect(f"ws://{self.host}", open_timeout=_TIMEOUT_S, max_size=2**25)
+            opening = connect(f"ws://{self.host}", open_timeout=_TIMEOUT_S, max_size=_LARGEST)
+            self._link = self._opened.enter_context(opening)
         except (OSError, WebSocketException) as error:
             reason = getattr(error, "strerror", None) or str(error) or "it does not answer"
             raise RobotError(f"no rosbridge at {self.host}: {reason}") from None
@@ -73,10 +77,9 @@ class Rosbridge:
 
     def disconnect(self) -> None:
         """Close; safe to call twice, or unconnected."""
-        link, self._link = self._link, None
-        if link is not None:
-            with contextlib.suppress(OSError, WebSocketException):
-                link.close()
+        self._link = None
+        with contextlib.suppress(OSError, WebSocketException):
+            self._opened.close()
 
     def _send(self, **message: Any) -> None:
         if self._link is None:
