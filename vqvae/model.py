@@ -36,11 +36,19 @@ class VqVae(nn.Module):
         first, second = config.channels
         depth = config.latent_channels
         self.encoder = nn.Sequential(
-            _halve(3, first), nn.ReLU(), _halve(first, second), nn.ReLU(), _halve(second, depth)
+            _halve(3, first),
+            nn.ReLU(inplace=True),
+            _halve(first, second),
+            nn.ReLU(inplace=True),
+            _halve(second, depth),
         )
         self.codebook = Codebook(config.codes, depth, config.decay, config.revive_after)
         self.decoder = nn.Sequential(
-            _double(depth, second), nn.ReLU(), _double(second, first), nn.ReLU(), _double(first, 3)
+            _double(depth, second),
+            nn.ReLU(inplace=True),
+            _double(second, first),
+            nn.ReLU(inplace=True),
+            _double(first, 3),
         )
         self.register_buffer("mean", torch.zeros(3, 1, 1))
         self.register_buffer("std", torch.ones(3, 1, 1))
@@ -99,9 +107,13 @@ class VqVae(nn.Module):
         return self.picture(self.decode_cells(self.codebook.code[self.codebook.nearest(cells)]))
 
     def fingerprint(self) -> str:
-        """Return a key of the weights: what was encoded by another model is of another key."""
+        """Return a key of the weights: what was encoded by another model is of another key.
+
+        The unit is left out, for codes do not depend on it.
+        """
         digest = hashlib.sha256(json.dumps(to_plain(self.config)).encode())
-        for name, tensor in sorted(self.state_dict().items()):
+        weights = {name: value for name, value in self.state_dict().items() if name != "unit"}
+        for name, tensor in sorted(weights.items()):
             digest.update(name.encode() + tensor.cpu().contiguous().numpy().tobytes())
         return digest.hexdigest()[:16]
 

@@ -20,7 +20,7 @@ from eisp_data.storage.cache import DatasetArrays, load_arrays, load_images
 from vqvae import saved
 from vqvae.calibrate import calibrate
 from vqvae.config import VisionConfig, VqVaeTrainConfig
-from vqvae.latents import check_images, encode
+from vqvae.latents import check_images, load_codes
 from vqvae.losses import loss
 from vqvae.model import STRIDE, VqVae
 from vqvae.quality import Quality, measure
@@ -67,7 +67,8 @@ def train(config: VqVaeTrainConfig) -> tuple[Path, Quality]:
         if update % config.validate_every == 0 or update == config.updates:
             quality = measure(model, held)
             if update == config.updates:
-                calibrate(model, encode(model, images), arrays, episodes)
+                codes = load_codes(config.dataset.root, model, config.dataset.camera)
+                calibrate(model, codes, arrays, episodes)
             bar.set_postfix(psnr=quality.psnr_db, used=quality.used)
             spent = time.monotonic() - start
             values: dict[str, float | Tensor] = {f"train/{k}": v for k, v in info.items()}
