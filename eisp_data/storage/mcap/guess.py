@@ -64,7 +64,8 @@ def _by_type(log: McapLog, topic: str) -> list[StreamMap]:
     if name in ("CompressedImage", "RawImage", "Image"):
         return [StreamMap(topic=topic, to=f"observation.images.{camera_name(topic)}")]
     if name in ("Event", "String"):
-        return [StreamMap(topic=topic, to="events")] if "event" in topic or name == "Event" else []
+        events = name == "Event" or "event" in topic or "episode" in topic
+        return [StreamMap(topic=topic, to="events")] if events else []
     if name in ("Vector", "Float64MultiArray", "Float32MultiArray", "TwistStamped"):
         last = topic.split("/")[-1]
         return [StreamMap(topic=topic, to=to) for to, words in _WORDS.items() if last in words]

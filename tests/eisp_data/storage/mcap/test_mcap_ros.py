@@ -273,6 +273,7 @@ def test_a_bag_with_usual_names_suggests_its_own_mapping(bag: Path) -> None:
         ("/joint_states", "", "observation.state"),
         ("/gripper", "", "observation.state"),
         ("/commands", "", "action"),
+        ("/episode", "", "events"),
         ("/camera/compressed", "", "observation.images.camera"),
         *(("/tf", f, f"observation.{to}") for f in ("block", "marker") for to in
           ("environment_state", "achieved_goal")),
