@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -41,7 +41,8 @@ class CollectConfig:
     output_dir: Path
     """Folder of the dataset."""
     task: str | None = None
-    """stack, push4, open_drawer or store."""
+    """stack, push4, open_drawer or store; open_drawer_image and store_image are the last two with
+    the camera images that their image variants are learned from."""
     env: EnvConfig = field(default_factory=EnvConfig)
     policy: Literal["scripted", "oracle", "random"] | None = None
     """scripted: a clumsy demonstrator that does a random part of the task (the default);
@@ -125,11 +126,14 @@ class _TaskSource:
     def __init__(self, config: CollectConfig) -> None:
         from eisp_data.policies.registry import DEMONSTRATOR, SCRIPTS
         from eisp_data.policies.script import Noise
+        from eisp_data.tasks.images import CAMERA, IMAGE_SIZE, IMAGE_TASKS, state_task
         from eisp_data.tasks.registry import get_task
 
-        self._config, self._task = config, get_task(str(config.task))
+        self._config, self._task = config, get_task(state_task(str(config.task)))
         self.policy = config.policy or "scripted"
         self.spec = _task_spec(self._task)
+        if config.task in IMAGE_TASKS:
+            self.spec = replace(self.spec, cameras={CAMERA: IMAGE_SIZE})
         self.recipe: dict[str, Any] = {}
         if self.policy != "random":
             self._script = SCRIPTS[self._task.name]
@@ -138,6 +142,17 @@ class _TaskSource:
             self.recipe["noise"] = asdict(self._noise)
 
     def episodes(self, seeds: range) -> Iterator[Episode]:
+        if not self.spec.cameras:
+            yield from self._states(seeds)
+            return
+        from eisp_data.sim.pixels import Pixels
+
+        [(camera, size)] = self.spec.cameras.items()
+        with Pixels(self._task, camera, *size) as pixels:
+            for episode in self._states(seeds):
+                yield replace(episode, images={camera: pixels.draw(episode.sim_state)})
+
+    def _states(self, seeds: range) -> Iterator[Episode]:
         from eisp_data import collect
         from eisp_data.sim.worlds import Worlds
 

@@ -48,3 +48,15 @@ def test_a_dataset_of_another_task_is_refused(images, vqvae_run):
     model, vision = load(vqvae_run)
     with pytest.raises(DataError, match="of 'open_drawer', the VQ-VAE was trained on 'store'"):
         latents.load_latent_arrays(images, model, replace(vision, task="store"))
+
+
+def test_an_image_task_is_collected_with_its_images(images, tmp_path):
+    from eisp_data.cli.collect import CollectConfig, collect
+    from eisp_data.storage.reader import read_spec
+
+    collect(CollectConfig(tmp_path / "seen", task="open_drawer_image", episodes=1, workers=1))
+    spec = read_spec(tmp_path / "seen")
+    assert (spec.task, dict(spec.cameras)) == ("open_drawer", {"shoulder": (48, 48)})
+    ours, theirs = load_images(tmp_path / "seen", "shoulder"), load_images(images, "shoulder")
+    # The same seed: drawn while it is collected, or afterwards.
+    assert np.abs(ours.astype(int) - theirs[: len(ours)]).mean() < 1.0
