@@ -14,6 +14,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -117,12 +118,13 @@ def write_peer(
     from lerobot.configs import RGBEncoderConfig
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    table = features(spec, {})
+    table = features(spec, partial(feature_info, spec.fps))
     for name in ("timestamp", "frame_index", "episode_index", "index", "task_index"):
         del table[name]
+    ours: dict[str, Any] = {}
     for feature in table.values():
         feature["shape"] = tuple(feature["shape"])
-        feature.pop("info", None)
+        ours = feature.pop("info", ours)
     dataset = LeRobotDataset.create(
         "bench/peer",
         spec.fps,
@@ -130,7 +132,7 @@ def write_peer(
         root=folder / "peer",
         use_videos=bool(spec.cameras),
         streaming_encoding=bool(spec.cameras),
-        rgb_encoder=RGBEncoderConfig.from_video_info(feature_info(spec.fps)) if our_codec else None,
+        rgb_encoder=RGBEncoderConfig.from_video_info(ours) if our_codec else None,
         # Its queue drops frames when full; one as long as the episode makes it keep them all.
         encoder_queue_maxsize=len(episodes[0]) + 1,
     )
