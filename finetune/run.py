@@ -13,6 +13,7 @@ from eisp_data.cli.collect import episode_seeds
 from eisp_data.collect import explore
 from eisp_data.config import load_yaml
 from eisp_data.errors import ConfigError
+from eisp_data.runs.folder import begin_run, has_progress
 from eisp_data.sim.gym_worlds import AnyWorlds, GymWorlds
 from eisp_data.sim.worlds import Worlds
 from eisp_data.storage.files import write_json
@@ -27,7 +28,7 @@ from pretrain.layout import Layout
 from pretrain.presets import preset
 from pretrain.replay import Trajectories
 from pretrain.saved import find_policy
-from pretrain.train import begin_run, gather, has_progress
+from pretrain.train import gather
 from pretrain.vision import load_seen
 from vqvae.worlds import ImageWorlds
 

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from eisp_data.config import from_plain, to_plain
 from eisp_data.errors import ConfigError, DataError
+from eisp_data.runs.disk import writing
 from eisp_data.storage.files import one_line, replace_atomically, write_json
 from pretrain.config import AgentConfig
 from pretrain.features import ObjectFeatures, PlainFeatures
@@ -19,7 +20,6 @@ from pretrain.proposers.hybrid import Hybrid
 from pretrain.proposers.movers import Movers
 from pretrain.proposers.proposer import SubgoalProposer
 from pretrain.sac import Sac
-from pretrain.saved import writing
 from vqvae.model import VqVae
 
 BANK = 4096

@@ -1,31 +1,18 @@
-"""Checkpoints in LeRobot's layout, that survive a kill at any moment.
-
-``checkpoints/<step>/pretrained_model/{config.json, model.safetensors}`` is the policy,
-``checkpoints/<step>/training_state/`` what is needed to go on, ``checkpoints/last`` the newest.
-Nothing is pickled.
-"""
+"""Checkpoints of an agent in training, see ``eisp_data.runs.checkpoint``."""
 
 from __future__ import annotations
 
-import json
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from safetensors.numpy import load_file as load_arrays
-from safetensors.numpy import save_file as save_arrays
-from torch import Tensor
 
 from eisp_data.errors import DataError
-from eisp_data.storage.files import one_line, sync
+from eisp_data.runs import MODEL, checkpoint
+from eisp_data.storage.files import one_line
 from pretrain.agent import Agent
-from pretrain.saved import POLICY, writing
-
-_STATE = "training_state"
-_KEPT = 2
 
 
 def save(
@@ -37,60 +24,8 @@ def save(
     numbers: Mapping[str, Any],
     arrays: Mapping[str, np.ndarray],
 ) -> None:
-    """Write a checkpoint beside its place, move it there, and drop all but the newest two.
-
-    Args:
-        run: the run's folder.
-        step: what the checkpoint is called, and which of two is newer.
-        agent: the policy.
-        optimizers: by name; they must be made the same way again before ``restore``.
-        rng: the run's generator.
-        numbers: JSON values.
-        arrays: whatever else must be restored.
-
-    Raises:
-        DataError: the disk is full or cannot be written to; the checkpoints before are whole.
-    """
-    folder = run / "checkpoints" / f"{step:06d}"
-    draft = folder.with_name(f".{folder.name}.draft")
-    shutil.rmtree(draft, ignore_errors=True)
-    plain = {"step": step, "rng": rng.bit_generator.state, "numbers": dict(numbers)}
-    tensors = {"torch_rng": torch.get_rng_state()} | _flatten(optimizers)
-    try:
-        agent.save(draft / POLICY)
-        with writing(folder):
-            _write_state(draft / _STATE, plain, tensors, arrays)
-            for path in (draft / POLICY, draft):
-                sync(path)
-            shutil.rmtree(folder, ignore_errors=True)
-            draft.rename(folder)
-            link = folder.with_name(".last")
-            link.unlink(missing_ok=True)
-            link.symlink_to(folder.name)
-            link.rename(folder.with_name("last"))
-            sync(folder.parent)
-    except DataError:
-        shutil.rmtree(draft, ignore_errors=True)  # a full disk has better use for the room
-        raise
-    steps = [path for path in folder.parent.iterdir() if path.name.isdigit()]
-    for old in sorted(steps, key=lambda path: int(path.name))[:-_KEPT]:
-        shutil.rmtree(old)
-
-
-def _write_state(
-    state: Path,
-    plain: Mapping[str, Any],
-    tensors: Mapping[str, Tensor],
-    arrays: Mapping[str, np.ndarray],
-) -> None:
-    state.mkdir()
-    # Contiguous and unshared, as the format wants them.
-    own = {name: np.array(value.cpu().numpy(), order="C") for name, value in tensors.items()}
-    others = {f"array/{name}": np.array(value, order="C") for name, value in arrays.items()}
-    save_arrays(own | others, state / "state.safetensors")
-    (state / "state.json").write_text(json.dumps(plain))
-    for path in (*state.iterdir(), state):
-        sync(path)
+    """Write a checkpoint of the agent; the rest is as in ``eisp_data.runs.checkpoint.save``."""
+    checkpoint.save(run, step, agent.save, optimizers, rng, numbers, arrays)
 
 
 def restore(
@@ -108,43 +43,9 @@ def restore(
         DataError: it is damaged, or of an agent made with other settings.
     """
     folder = run / "checkpoints" / "last"
-    saved = Agent.load(folder / POLICY).state_dict()
+    saved = Agent.load(folder / MODEL).state_dict()
     try:
         agent.load_state_dict(saved)
-        plain = json.loads((folder / _STATE / "state.json").read_text())
-        tensors = load_arrays(folder / _STATE / "state.safetensors")
-        _unflatten(optimizers, tensors)
-        torch.set_rng_state(torch.from_numpy(tensors["torch_rng"]))
-        rng.bit_generator.state = plain["rng"]
-        step, numbers = plain["step"], plain["numbers"]
-    except Exception as error:  # torch and each format have errors of their own
+    except RuntimeError as error:
         raise DataError(f"{folder} cannot be resumed from: {one_line(error)}") from None
-    arrays = {k.removeprefix("array/"): v for k, v in tensors.items() if k.startswith("array/")}
-    return step, numbers, arrays
-
-
-def exists(run: Path) -> bool:
-    """Return whether the run has a checkpoint."""
-    return (run / "checkpoints" / "last" / _STATE / "state.json").exists()
-
-
-def _flatten(optimizers: Mapping[str, torch.optim.Optimizer]) -> dict[str, Tensor]:
-    return {
-        f"{name}/{index}/{key}": torch.as_tensor(value)
-        for name, optimizer in optimizers.items()
-        for index, state in optimizer.state_dict()["state"].items()
-        for key, value in state.items()
-    }
-
-
-def _unflatten(
-    optimizers: Mapping[str, torch.optim.Optimizer], tensors: Mapping[str, np.ndarray]
-) -> None:
-    for name, optimizer in optimizers.items():
-        state: dict[int, dict[str, Tensor]] = {}
-        for path, value in tensors.items():
-            if path.startswith(f"{name}/"):
-                _, index, key = path.split("/")
-                state.setdefault(int(index), {})[key] = torch.from_numpy(value)
-        groups = optimizer.state_dict()["param_groups"]
-        optimizer.load_state_dict({"state": state, "param_groups": groups})
+    return checkpoint.restore(run, optimizers, rng)

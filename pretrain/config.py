@@ -12,9 +12,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from eisp_data.runs import DeviceName
 from vqvae.config import VisionConfig
-
-DeviceName = Literal["auto", "cpu", "cuda"]
 
 
 @dataclass(frozen=True)

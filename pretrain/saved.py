@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-
-from safetensors import SafetensorError
 
 from eisp_data.config import from_plain
 from eisp_data.errors import DataError
-from eisp_data.storage.files import one_line
+from eisp_data.runs import MODEL
 from pretrain.config import SubgoalConfig
 
-POLICY = "pretrained_model"
+POLICY = MODEL
 
 
 def find_policy(path: Path) -> Path:
@@ -38,13 +34,3 @@ def saved_subgoals(path: Path) -> SubgoalConfig:
         return from_plain(SubgoalConfig, plain["agent"]["subgoals"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path} holds no readable policy: {error}") from None
-
-
-@contextmanager
-def writing(place: Path) -> Iterator[None]:
-    """Turn what a full disk raises within the ``with`` into a DataError of one line."""
-    try:
-        yield
-    except (OSError, SafetensorError) as error:
-        reason = (isinstance(error, OSError) and error.strerror) or one_line(error)
-        raise DataError(f"{place} cannot be written: {reason}") from None

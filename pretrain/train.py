@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from eisp_data.config import save_yaml
-from eisp_data.errors import ConfigError, DataError
+from eisp_data.errors import DataError
+from eisp_data.runs.folder import begin_run, has_progress
 from eisp_data.runs.metrics import MetricsLog
 from eisp_data.storage.cache import DatasetArrays
 from eisp_data.tasks.registry import TASKS
@@ -160,25 +160,3 @@ def gather(
         np.concatenate([[0], np.cumsum(stops - starts)]),
     )
     return data
-
-
-def has_progress(run: Path, resume: bool, name: str) -> bool:
-    """Return whether the run has a checkpoint to go on from; a resumed one may have none yet.
-
-    Raises:
-        ConfigError: there is no such run to resume, or something is in the way of a new one.
-    """
-    if resume and not (run / name).exists():
-        raise ConfigError(f"--resume: {run} holds no run, {name} is missing")
-    if not resume and run.exists() and any(run.iterdir()):
-        raise ConfigError(f"{run} is not empty; add --resume or choose another --output-dir")
-    return resume and checkpoint.exists(run)
-
-
-def begin_run(run: Path, config: object, name: str) -> None:
-    """Make the folder of a run and write its configuration, once all input has proved usable."""
-    try:
-        run.mkdir(parents=True, exist_ok=True)
-        save_yaml(config, run / name)
-    except OSError as error:
-        raise ConfigError(f"cannot write to {run}: {error.strerror}") from None

@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING
 
 from eisp_data.config import from_plain, to_plain
 from eisp_data.errors import ConfigError, DataError
+from eisp_data.runs import MODEL
 from eisp_data.storage.files import one_line, replace_atomically, write_json
 from vqvae.config import VisionConfig
 
 if TYPE_CHECKING:  # it needs torch, and a command line has to be read before
     from vqvae.model import VqVae
-
-_MODEL = "pretrained_model"
 
 
 def save(model: VqVae, vision: VisionConfig, folder: Path) -> None:
@@ -28,7 +27,7 @@ def save(model: VqVae, vision: VisionConfig, folder: Path) -> None:
 
 def find(path: Path) -> Path:
     """Return the folder of the VQ-VAE for a path that names it, its checkpoint or its run."""
-    for folder in (path, path / _MODEL, path / "checkpoints" / "last" / _MODEL):
+    for folder in (path, path / MODEL, path / "checkpoints" / "last" / MODEL):
         if (folder / "model.safetensors").exists() and (folder / "config.json").exists():
             return folder
     raise DataError(f"{path} holds no VQ-VAE; give a run of eisp-vqvae train")

@@ -13,7 +13,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from eisp_data.errors import ConfigError, DataError
-from eisp_data.runs import checkpoint
+from eisp_data.runs import MODEL, checkpoint
 from eisp_data.runs.folder import begin_run, has_progress
 from eisp_data.runs.metrics import MetricsLog
 from eisp_data.storage.cache import DatasetArrays, load_arrays, load_images
@@ -48,7 +48,7 @@ def train(config: VqVaeTrainConfig) -> tuple[Path, Quality]:
     vision = VisionConfig(arrays.spec.task, config.dataset.camera, config.model)
     done, spent = 0, 0.0
     if resumed:
-        folder = run / "checkpoints" / "last" / checkpoint.MODEL
+        folder = run / "checkpoints" / "last" / MODEL
         model.load_state_dict(saved.load(folder)[0].state_dict())
         done, numbers, _ = checkpoint.restore(run, {"adam": optimizer}, rng)
         spent = numbers["wall_s"]

@@ -3,3 +3,5 @@
 from typing import Literal
 
 DeviceName = Literal["auto", "cpu", "cuda"]
+MODEL = "pretrained_model"
+"""Folder of the model in a checkpoint, as in LeRobot."""

@@ -8,21 +8,20 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 from torch import Tensor
 
 from eisp_data.errors import DataError
+from eisp_data.runs import MODEL
+from eisp_data.runs.disk import writing
 from eisp_data.storage.files import one_line, sync
 
-MODEL = "pretrained_model"
 _STATE = "training_state"
 _KEPT = 2
 
@@ -104,16 +103,6 @@ def restore(
 def exists(run: Path) -> bool:
     """Return whether the run has a checkpoint."""
     return (run / "checkpoints" / "last" / _STATE / "state.json").exists()
-
-
-@contextmanager
-def writing(place: Path) -> Iterator[None]:
-    """Turn what a full disk raises within the ``with`` into a DataError of one line."""
-    try:
-        yield
-    except (OSError, SafetensorError) as error:
-        reason = (isinstance(error, OSError) and error.strerror) or one_line(error)
-        raise DataError(f"{place} cannot be written: {reason}") from None
 
 
 def _write_state(

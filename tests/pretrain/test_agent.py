@@ -128,7 +128,7 @@ def test_a_save_that_breaks_off_leaves_the_policy_as_it_was(saved, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("pretrain.agent.save_file", fails)
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(DataError, match="No space"):
         stack_agent().save(saved)
     assert {path.name: path.read_bytes() for path in saved.iterdir()} == before
 

@@ -10,6 +10,7 @@ import torch
 from learning_samples import linear_agent
 
 from eisp_data.errors import DataError
+from eisp_data.runs import checkpoint as runs
 from pretrain import checkpoint
 from pretrain.agent import Agent
 
@@ -113,7 +114,7 @@ def test_whenever_a_save_is_killed_the_last_checkpoint_is_whole(tmp_path, monkey
     for step in (1, 2):
         training.save(tmp_path / "whole", step)
     places = [(Path, name) for name in ("rename", "symlink_to", "unlink", "mkdir", "write_text")]
-    places += [(os, "replace"), (shutil, "rmtree"), (checkpoint, "sync"), (Agent, "save")]
+    places += [(os, "replace"), (shutil, "rmtree"), (runs, "sync"), (Agent, "save")]
     kills = 0
     for kill_at in range(100):
         run = tmp_path / str(kill_at)
@@ -128,7 +129,7 @@ def test_whenever_a_save_is_killed_the_last_checkpoint_is_whole(tmp_path, monkey
             except Killed:
                 killed = True
         kills += killed
-        assert checkpoint.exists(run)
+        assert runs.exists(run)
         assert Training().restore(run)[0] in ((2, 3) if killed else (3,))
         Training().save(run, 3)
         assert steps_of(run) == ["000002", "000003", "last"]
@@ -172,7 +173,7 @@ def test_a_checkpoint_of_an_agent_with_other_settings_is_told_in_one_line(tmp_pa
 
 
 def test_a_run_without_a_checkpoint_says_so(tmp_path):
-    assert not checkpoint.exists(tmp_path)
+    assert not runs.exists(tmp_path)
     with pytest.raises(DataError, match="holds no policy"):
         Training().restore(tmp_path)
 

@@ -117,7 +117,7 @@ def test_what_is_held_out_is_never_learned_from(stack_dataset, tmp_path, monkeyp
     for name in ("as it is", "shifted"):
         config = tiny_pretraining(stack_dataset, tmp_path / name, validate_every=12)
 
-        def load(config, shift=float(name == "shifted")):
+        def load(config, vision, shift=float(name == "shifted")):
             train, held_out, layout = load_trajectories(config)
             held_out.observation += shift
             held_out.achieved_goal += shift
