@@ -56,12 +56,12 @@ def state_from_estimates(task: Task, estimates: Estimates) -> np.ndarray:
         place, speed = place + 1, speed + 1
     for index in range(task.blocks):
         block = _seen(estimates, f"block{index}")
-        pose = block.transform_object_to_task
-        qpos[place : place + 3] = pose[:3, 3]
-        qpos[place + 3 : place + 7] = _quaternion(pose[:3, :3])
+        rotation = upright(block.transform_object_to_task[:3, :3])
+        qpos[place : place + 3] = block.transform_object_to_task[:3, 3]
+        qpos[place + 3 : place + 7] = _quaternion(rotation)
         qvel[speed : speed + 3] = block.velocity
         # MuJoCo has the angular velocity in the frame of the body.
-        qvel[speed + 3 : speed + 6] = pose[:3, :3].T @ block.spin
+        qvel[speed + 3 : speed + 6] = rotation.T @ block.spin
         place, speed = place + 7, speed + 6
     return state
 
@@ -74,6 +74,20 @@ def observation_from_estimates(task: Task, estimates: Estimates) -> tuple[np.nda
     """
     state = state_from_estimates(task, estimates)[None]
     return task.observe(state)[0], task.achieved_goal(state)[0]
+
+
+def upright(rotation: np.ndarray) -> np.ndarray:
+    """Return the cube's rotation (3, 3) with the least tilt and the least turn.
+
+    A cube looks the same on each of its faces. Policies know blocks that started upright and
+    unturned; on a real table they lie on any face.
+    """
+    column = int(np.abs(rotation[2]).argmax())
+    up = rotation[:, column] * np.sign(rotation[2, column])
+    sides = np.delete(rotation, column, axis=1)
+    sides = np.concatenate([sides, -sides], axis=1)
+    ahead = sides[:, sides[0].argmax()]
+    return np.stack([ahead, np.cross(up, ahead), up], axis=1)
 
 
 def _seen(estimates: Estimates, name: str) -> ObjectEstimate:

@@ -64,8 +64,13 @@ def marked_objects(task: Task) -> dict[str, MarkedObject]:
     if task.fixtures:
         objects.append(MarkedObject("drawer", _in_drawer()))
     objects.append(MarkedObject("gripper", _on_gripper()))
-    objects.append(MarkedObject("table", _on_table()))
+    objects.append(table_markers())
     return {item.name: item for item in objects}
+
+
+def table_markers() -> MarkedObject:
+    """Return the table, whose frame is the task's."""
+    return MarkedObject("table", _on_table())
 
 
 def dictionary() -> Any:
@@ -75,7 +80,7 @@ def dictionary() -> Any:
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, DICTIONARY))
 
 
-def _facing(normal: Any, up: Any, position: Any) -> np.ndarray:
+def facing(normal: Any, up: Any, position: Any) -> np.ndarray:
     """Return the (4, 4) transform of a marker with that normal (z) and reading direction (y)."""
     z, y = np.array(normal, dtype=float), np.array(up, dtype=float)
     return transform(np.stack([np.cross(y, z), y, z], axis=1), np.array(position, dtype=float))
@@ -97,7 +102,7 @@ def _on_block(index: int) -> tuple[Marker, ...]:
         Marker(
             _BLOCK_IDS + 6 * index + face,
             BLOCK_MARKER_M,
-            _facing(normal, up, half * np.array(normal)),
+            facing(normal, up, half * np.array(normal)),
         )
         for face, (normal, up) in enumerate(faces)
     )
@@ -117,7 +122,7 @@ def _in_drawer() -> tuple[Marker, ...]:
         for side in (-1, 1)
     ]
     return tuple(
-        Marker(_DRAWER_IDS + i, DRAWER_MARKER_M, _facing(*place)) for i, place in enumerate(places)
+        Marker(_DRAWER_IDS + i, DRAWER_MARKER_M, facing(*place)) for i, place in enumerate(places)
     )
 
 
@@ -129,7 +134,7 @@ def _on_gripper() -> tuple[Marker, ...]:
         Marker(
             _GRIPPER_IDS,
             GRIPPER_MARKER_M,
-            _facing((slope, 0, slope), (-slope, 0, slope), (0.036, 0, 0.112)),
+            facing((slope, 0, slope), (-slope, 0, slope), (0.036, 0, 0.112)),
         ),
     )
 
@@ -139,6 +144,6 @@ def _on_table() -> tuple[Marker, ...]:
     """Four around the workspace: they tell whether the camera is where it was calibrated."""
     places = ((0.15, 0.27), (0.15, -0.27), (0.46, 0.235), (0.46, -0.235))
     return tuple(
-        Marker(_TABLE_IDS + i, TABLE_MARKER_M, _facing((0, 0, 1), (-1, 0, 0), (x, y, 0.0005)))
+        Marker(_TABLE_IDS + i, TABLE_MARKER_M, facing((0, 0, 1), (-1, 0, 0), (x, y, 0.0005)))
         for i, (x, y) in enumerate(places)
     )

@@ -49,7 +49,7 @@ class BlockTrack:
         self.spin: np.ndarray = np.zeros(3)
         self.seen_s = -np.inf
         self._grasp: np.ndarray | None = None
-        self._grasp_variance = np.zeros((3, 3))
+        self._grasp_variance: np.ndarray = np.zeros((3, 3))
         self._seen: np.ndarray | None = None
         self._elsewhere: np.ndarray | None = None
         self._contradictions = 0

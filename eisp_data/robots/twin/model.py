@@ -12,7 +12,7 @@ import numpy as np
 from eisp_data.robots import cell
 from eisp_data.robots.markers import marked_objects
 from eisp_data.robots.twin.arm import arm_spec
-from eisp_data.robots.twin.stickers import stick
+from eisp_data.robots.twin.stickers import stick, stick_board
 from eisp_data.tasks.base import Task
 
 HAND = "hand/"
@@ -31,12 +31,12 @@ _UNSEEN = 4
 _PALE = np.array([0.80, 0.77, 0.72])
 
 
-def cell_spec(task: Task) -> mujoco.MjSpec:
-    """Return the cell of a task, to be changed or compiled."""
+def cell_spec(task: Task, board: bool = False) -> mujoco.MjSpec:
+    """Return the cell of a task, to be changed or compiled; the gripper may hold the board."""
     spec = mujoco.MjSpec.from_string(task.scene)
     spec.delete(spec.body("gripper"))
     _mount_arm(spec, task)
-    _mark(spec, task)
+    _mark(spec, task, board)
     spec.option.timestep = TIMESTEP_S
     # The light of the scene leaves the faces that the camera sees in the dark.
     spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.4] * 3, [0.55] * 3
@@ -74,10 +74,12 @@ def _mount_arm(spec: mujoco.MjSpec, task: Task) -> None:
     gripper.add_site(name=TOOL, group=_UNSEEN)
 
 
-def _mark(spec: mujoco.MjSpec, task: Task) -> None:
+def _mark(spec: mujoco.MjSpec, task: Task, board: bool) -> None:
     """Put the markers on all that carries some."""
     for item in marked_objects(task).values():
-        if item.name == "gripper":
+        if item.name == "gripper" and board:
+            stick_board(spec, spec.body(f"{HAND}gripper"))
+        elif item.name == "gripper":
             stick(spec, spec.body(f"{HAND}gripper"), item, _DARK)
         elif item.name == "table":
             stick(spec, spec.worldbody, item, _PALE)

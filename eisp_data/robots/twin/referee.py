@@ -11,6 +11,7 @@ from eisp_data.robots import cell
 from eisp_data.robots.twin.camera import MountedCamera
 from eisp_data.robots.twin.model import FINGERS, TOOL
 from eisp_data.robots.twin.world import World
+from eisp_data.sim.scene import BLOCK_SIZE_M
 from eisp_data.tasks.base import Task, is_success
 
 
@@ -95,6 +96,11 @@ class Referee:
             joint.qpos[3:] = [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
             joint.qvel[:] = 0.0
             mujoco.mj_forward(self._world.model, self._world.data)
+
+    def clear_table(self) -> None:
+        """Put the blocks out of the way, at the far end of the table."""
+        for block in range(self._task.blocks):
+            self.move_block(block, np.array([0.62, -0.3 + 0.15 * block, BLOCK_SIZE_M / 2]))
 
     def _set_objects(self, state: np.ndarray) -> None:
         qpos, data = self._task.qpos(state), self._world.data

@@ -22,6 +22,7 @@ from eisp_data.robots.twin.camera import (
     CAMERA,
     CameraOptions,
     Lens,
+    MountedCamera,
     TwinCamera,
     aim_camera,
     designed_intrinsics,
@@ -58,6 +59,7 @@ class TwinRobot(Robot):
         realtime: bool = False,
         seed: int = 0,
         camera: CameraOptions | None = None,
+        board: bool = False,
     ) -> None:
         """Build the cell; its objects stand where the task's start of that seed has them.
 
@@ -66,6 +68,7 @@ class TwinRobot(Robot):
             realtime: whether its clock is the wall's; else it stands still but for ``wait_until``.
             seed: of the start, and of all noise.
             camera: what is not ideal about the camera.
+            board: whether the gripper holds the calibration board.
 
         Raises:
             ConfigError: no such task, a bad option, or the ``robot`` extra is not installed.
@@ -86,13 +89,15 @@ class TwinRobot(Robot):
         mounted = mount_camera(options, mounting)
         self._lens = Lens(mounted.intrinsics)
         self._options, self._realtime = options, realtime
-        self._model = self._build(mounted)
+        self._model = self._build(mounted, board)
         self._world = World(self._model, self.limits, options, self._rng)
         self._lock = threading.RLock()
         self._eye: LazyEye | ThreadEye | None = None
         self._origin_s = 0.0
         self.referee = Referee(self.task, self._world, mounted, self._lock)
         self.referee.reset(seed)
+        if board:
+            self.referee.clear_table()
 
     def connect(self) -> None:
         """Start the clock and the camera; ConfigError if there is no OpenGL on this machine."""
@@ -167,8 +172,8 @@ class TwinRobot(Robot):
             self._eye.close()
             self._eye = None
 
-    def _build(self, mounted: mujoco.MjModel) -> mujoco.MjModel:
-        spec = cell_spec(self.task)
+    def _build(self, mounted: MountedCamera, board: bool) -> mujoco.MjModel:
+        spec = cell_spec(self.task, board)
         aim_camera(spec, mounted, self._lens)
         return spec.compile()
 
