@@ -73,6 +73,12 @@ class Kinematics:
         """Return the smallest singular value of the Jacobian: 0 at a singularity."""
         return float(np.linalg.svd(self.jacobian(joint_position), compute_uv=False)[-1])
 
+    def random_postures(self, rng: np.random.Generator, count: int) -> np.ndarray:
+        """Draw (count, J) rad uniformly within the limits; of whole turns, one."""
+        low = np.where(self._turns, np.maximum(self.low, -np.pi), self.low)
+        high = np.where(self._turns, np.minimum(self.high, np.pi), self.high)
+        return rng.uniform(low, high, (count, len(low)))
+
     def inverse(
         self,
         transform_tool_to_base: np.ndarray,
@@ -184,11 +190,7 @@ class Kinematics:
         return pin.SE3(transform_tool_to_base) * self._joint_to_tool
 
     def _fill_table(self) -> None:
-        rng = np.random.default_rng(0)
-        low, high = np.maximum(self.low, -np.pi), np.minimum(self.high, np.pi + 1e-9)
-        low = np.where(self._turns, low, self.low)
-        high = np.where(self._turns, high, self.high)
-        self._table = rng.uniform(low, high, (_TABLE_SIZE, len(low)))
+        self._table = self.random_postures(np.random.default_rng(0), _TABLE_SIZE)
         self._features = np.stack([_feature(self.forward(row)) for row in self._table])
         self._norms = (self._features**2).sum(axis=1)
 

@@ -20,10 +20,7 @@ def kinematics(request):
 
 
 def postures(kinematics, count, seed=0):
-    low, high = np.maximum(kinematics.low, -np.pi), np.minimum(kinematics.high, np.pi)
-    # TIAGo's third joint alone goes beyond half a turn, and not all the way round.
-    high = np.where(kinematics.high - low < 2 * np.pi, kinematics.high, high)
-    return np.random.default_rng(seed).uniform(low, high, (count, len(low)))
+    return kinematics.random_postures(np.random.default_rng(seed), count)
 
 
 def pose_error(one, other):
