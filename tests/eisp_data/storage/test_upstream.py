@@ -126,9 +126,15 @@ def test_splitting_and_merging_again_gives_the_same_episodes(make_dataset, edit,
     parts = [tmp_path / "split/even", tmp_path / "split/odd", other]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("datasets.config.HF_DATASETS_CACHE", str(tmp_path / "hf2"))
-        from lerobot.datasets import merge_datasets
-
-        merge_datasets([open_upstream(p) for p in parts], "test/all", tmp_path / "all")
+        edit(
+            **{
+                "new_repo_id": "test/all",
+                "new_root": tmp_path / "all",
+                "operation.type": "merge",
+                "operation.repo_ids": json.dumps([f"test/{part.name}" for part in parts]),
+                "operation.roots": json.dumps([str(part) for part in parts]),
+            }
+        )
     check(tmp_path / "all", [*episodes[::2], *episodes[1::2], *more])
     recipes = [{"policy": "script", "seed": 0}, {"policy": "script", "seed": 100}]
     assert read_recipe(tmp_path / "all") == {"merged": recipes}
