@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from eisp_data.config import to_plain
 from vqvae.codebook import Codebook
 from vqvae.config import VqVaeConfig
+from vqvae.deconvolution import Double
 
 STRIDE = 8
 """Pixels of an image along each side of a code."""
@@ -44,11 +45,11 @@ class VqVae(nn.Module):
         )
         self.codebook = Codebook(config.codes, depth, config.decay, config.revive_after)
         self.decoder = nn.Sequential(
-            _double(depth, second),
+            Double(depth, second),
             nn.ReLU(inplace=True),
-            _double(second, first),
+            Double(second, first),
             nn.ReLU(inplace=True),
-            _double(first, 3),
+            Double(first, 3),
         )
         self.register_buffer("mean", torch.zeros(3, 1, 1))
         self.register_buffer("std", torch.ones(3, 1, 1))
@@ -125,7 +126,3 @@ class VqVae(nn.Module):
 
 def _halve(inputs: int, outputs: int) -> nn.Conv2d:
     return nn.Conv2d(inputs, outputs, kernel_size=4, stride=2, padding=1)
-
-
-def _double(inputs: int, outputs: int) -> nn.ConvTranspose2d:
-    return nn.ConvTranspose2d(inputs, outputs, kernel_size=4, stride=2, padding=1)
