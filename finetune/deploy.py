@@ -140,6 +140,8 @@ def _prepare(config: DeployConfig) -> tuple[Task, Agent | None]:
             "--threads": config.threads,
         },
     )
+    if config.episode_s is not None and not 0 < config.episode_s < float("inf"):
+        raise ConfigError(f"--episode-s must be above 0; got {config.episode_s}")
     if config.task is None:
         raise ConfigError("missing --task")
     task = get_task(config.task)
@@ -175,7 +177,7 @@ def _plan(run: _Run) -> Plan:
     return Plan(
         run.report.output,
         config.episodes - run.first,
-        _STEP_S * steps,
+        _STEP_S * steps if config.episode_s is None else config.episode_s,
         config.pause_s,
         metadata,
         run.first,

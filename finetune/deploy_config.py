@@ -28,6 +28,8 @@ class DeployConfig(CellConfig):
     """Ticks of the robot for each step of the policy, which was trained at 1 m/s: more are slower
     and gentler."""
     episodes: int = 1
+    episode_s: float | None = None
+    """The longest that an episode may last; the task's steps, and the looks, if left out."""
     pause_s: float = 30.0
     """Between two episodes a human has so long to set the table, or presses enter before."""
     interference: bool = False

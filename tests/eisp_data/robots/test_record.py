@@ -1,0 +1,214 @@
+"""Recording a robot: deadlines, rates, humans at the controls, and every way to end."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bench_robot import BenchRobot
+from hand_on_device import HandOnGamepad, HandOnKeyboard
+
+from eisp_data.errors import ConfigError, EispError, RobotError
+from eisp_data.robots import registry, teleop
+from eisp_data.robots.loop import Ticks
+from eisp_data.robots.record import RecordConfig, check, record
+from eisp_data.robots.session import Session
+from eisp_data.storage.lerobot import read_episodes
+from eisp_data.storage.mcap.convert import ConvertConfig, convert
+from eisp_data.storage.mcap.reader import McapLog
+from eisp_data.storage.mcap.windows import cut
+
+PERIOD_S = 0.04
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> type[BenchRobot]:
+    """The robot in memory, as ``--robot bench``."""
+    entry = type(registry.ROBOTS["twin"])("bench_robot:BenchRobot", "robot")
+    monkeypatch.setitem(registry.ROBOTS, "bench", entry)
+    monkeypatch.setattr(BenchRobot, "made", [])
+    return BenchRobot
+
+
+def hand_on(monkeypatch: pytest.MonkeyPatch, source: object) -> None:
+    monkeypatch.setattr(teleop, "_make", lambda device: source)
+
+
+def recorded(tmp_path: Path, **options: object) -> RecordConfig:
+    return RecordConfig(
+        robot="bench", host="none", output=tmp_path / "a.mcap", control="gamepad", **options
+    )
+
+
+def test_deadlines_are_absolute_and_those_that_pass_altogether_are_counted() -> None:
+    robot = BenchRobot()
+    start, work_s = robot.now_s(), [0.01, 0.05, 0.01, 0.10, 0.01]
+    ticks, begun = Ticks(robot, 25.0), []
+    for deadline in ticks.run(lambda part: None):
+        begun.append((deadline / 1e9 - start) / PERIOD_S)
+        if not work_s:
+            break
+        robot.wait_until(robot.now_s() + work_s.pop(0))
+    # 50 ms of work make the next tick 10 ms late; 100 ms leave one out, and the next is late too.
+    assert np.round(begun, 6).tolist() == [0, 1, 2, 3, 5, 6]
+    timing = ticks.timing()
+    assert (timing.ticks, timing.dropped) == (6, 1)
+    assert timing.late_max_ms == pytest.approx(20.0, abs=0.01)
+    assert timing.late_median_ms == pytest.approx(0.0, abs=0.01)
+
+
+def test_each_source_is_recorded_at_its_own_rate_with_its_own_time(
+    tmp_path: Path, bench: type[BenchRobot], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hand_on(monkeypatch, HandOnGamepad(reads=50))
+    report = record(recorded(tmp_path))
+    assert report.timing is not None and report.timing.dropped == 0
+    with McapLog(report.output) as log:
+        counts = {topic: stats.count for topic, stats in log.stats().items()}
+        images = list(log.messages({"/camera/top/image"}))
+        assert log.indexed and not log.problems
+    assert counts["/action"] == counts["/joint_command"] == 50
+    assert counts["/joint_states"] == pytest.approx(2 * 100, abs=2)
+    assert counts["/camera/top/image"] == pytest.approx(2 * 27, abs=2)
+    assert report.lost_frames["top"] == pytest.approx(2 * 3, abs=1)
+    steps = np.diff([entry.message.publish_time_ns for entry in images]) / 1e9
+    assert set(np.round(steps * 30)) == {1.0, 2.0}
+
+
+def test_a_teleoperated_session_becomes_a_dataset_of_what_the_hand_did(
+    tmp_path: Path, bench: type[BenchRobot], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hand_on(monkeypatch, HandOnGamepad(reads=20))
+    report = record(recorded(tmp_path, teleop_speed=0.2, operator="ann"))
+    convert(ConvertConfig(inputs=(report.output,), to=tmp_path / "data"))
+    [episode] = read_episodes(tmp_path / "data")
+    assert episode.action.shape == (20, 4) and episode.observation.shape[0] == 21
+    np.testing.assert_allclose(episode.action, np.tile([0.1, 0.05, 0.0, -1.0], (20, 1)), atol=1e-6)
+    assert episode.info["outcome"] == "success"
+    way = episode.achieved_goal[-1] - episode.achieved_goal[0]
+    # Half a deflection at 0.2 m/s for 0.8 s, less what gaining speed takes.
+    assert 0.06 < way[0] <= 0.08 and way[1] == pytest.approx(way[0] / 2, abs=0.003)
+    assert bench.made[0].sent[-1].gripper_opening_m == 0.0
+
+
+def test_directions_of_the_keyboard_are_those_of_the_table_and_a_held_key_counts_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    source = HandOnKeyboard()
+    hand_on(monkeypatch, source)
+    keyboard = teleop.Teleop("keyboard")
+    first, second = keyboard.read(), keyboard.read()
+    assert first.motion.tolist() == [1.0, 0.0, 0.0] and first.takes_over
+    assert (first.outcome, second.outcome) == ("success", None)
+    assert source.current_pressed == {"up": True}
+    keyboard.close()
+    with pytest.raises(RobotError, match="keyboard: disconnected"):
+        keyboard.read()
+
+
+@pytest.mark.parametrize("device", ["keyboard", "gamepad"])
+def test_a_device_that_is_not_there_is_one_line(device: teleop.Device) -> None:
+    with pytest.raises(EispError) as error:
+        teleop.Teleop(device)
+    assert str(error.value).startswith(device) and "\n" not in str(error.value)
+
+
+def end_of(path: Path) -> tuple[bool, list[str], int]:
+    """Return whether a recording has its index, how its episodes ended, and its actions."""
+    from eisp_data.storage.mcap import decode
+
+    decoder, events = decode.Decoder(), []
+    with McapLog(path) as log:
+        for entry in log.messages({"/events"}):
+            events.append(
+                decoder.decode(entry.channel, log.schema_of(entry.channel), entry.message.data)
+            )
+        count = log.stats()["/action"].count
+        assert not log.problems
+        windows = cut(events, 0, 0)
+        assert all(window.complete for window in windows)
+        return log.indexed, [window.outcome for window in windows], count
+
+
+def test_a_camera_that_is_unplugged_leaves_a_standing_robot_and_a_closed_log(
+    tmp_path: Path,
+    bench: type[BenchRobot],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    hand_on(monkeypatch, HandOnGamepad(reads=100))
+    monkeypatch.setattr(BenchRobot, "unplugs_after_s", 11.0)
+    with pytest.raises(RobotError, match="camera 'top' is unplugged"):
+        record(recorded(tmp_path))
+    assert bench.made[0].standing and not bench.made[0].connected
+    assert end_of(tmp_path / "a.mcap") == (True, [""], 26)
+    assert "26 ticks at 25 Hz" in capsys.readouterr().out
+
+
+def test_ctrl_c_ends_between_two_ticks_with_a_standing_robot_and_a_closed_log(
+    tmp_path: Path, bench: type[BenchRobot], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class HandThatPressesCtrlC(HandOnGamepad):
+        def get_action(self) -> dict[str, float]:
+            if len(bench.made[0].sent) == 9:
+                os.kill(os.getpid(), signal.SIGINT)
+            return super().get_action()
+
+    hand_on(monkeypatch, HandThatPressesCtrlC(reads=100))
+    before = signal.getsignal(signal.SIGINT)
+    report = record(recorded(tmp_path, episodes=3))
+    assert [ended.outcome for ended in report.episodes] == [""]
+    assert bench.made[0].standing and not bench.made[0].connected
+    assert end_of(tmp_path / "a.mcap") == (True, [""], 10)
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_an_error_of_our_own_leaves_a_standing_robot_and_a_closed_log(
+    tmp_path: Path, bench: type[BenchRobot], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hand_on(monkeypatch, HandOnGamepad(reads=100))
+
+    def fail(self: Session, *_: object) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(Session, "_note", fail)
+    with pytest.raises(ZeroDivisionError):
+        record(recorded(tmp_path))
+    assert bench.made[0].standing and not bench.made[0].connected
+    with McapLog(tmp_path / "a.mcap") as log:
+        assert log.indexed and not log.problems
+
+
+def test_a_dry_run_commands_nothing(
+    tmp_path: Path, bench: type[BenchRobot], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hand_on(monkeypatch, HandOnGamepad(reads=10))
+    report = record(recorded(tmp_path, dry_run=True))
+    assert not bench.made[0].sent and bench.made[0].standing
+    assert end_of(report.output)[2] == 10
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"control": "magic"}, "choose one of keyboard, gamepad, script"),
+        ({"control": "script", "task": None}, "missing --task"),
+        ({"episodes": 0}, "--episodes must be at least 1; got 0"),
+        ({"teleop_speed": 2.0}, "--teleop-speed"),
+        ({"episode_s": float("nan")}, "--episode-s"),
+    ],
+)
+def test_settings_that_cannot_be_used_are_one_line(
+    tmp_path: Path, options: dict[str, object], said: str
+) -> None:
+    with pytest.raises(ConfigError, match=said):
+        check(RecordConfig(**{"output": tmp_path / "a.mcap", "task": "stack", **options}))
+
+
+def test_a_recording_is_never_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "a.mcap").write_bytes(b"")
+    with pytest.raises(ConfigError, match="exists already"):
+        check(RecordConfig(output=tmp_path / "a.mcap", task="stack"))
