@@ -22,7 +22,7 @@ from vqvae.saved import load
 from vqvae.train import CONFIG_FILE, rows_of, split, spread
 
 _DRAWN = 1000
-_MOST = 20_000
+_MOST = 5_000
 
 
 @dataclass(frozen=True)
