@@ -219,24 +219,23 @@ class SafetyFilter:
         return np.maximum(joints.max(axis=1), tool.max(axis=1))
 
     def _within_effort(self, path: np.ndarray, velocities: np.ndarray) -> bool:
-        """Whether the torques of the whole way, from this step to rest, are within the limits."""
+        """Whether the torques of the whole way, to rest and at rest, are within the limits."""
         still = np.zeros_like(self._moving)
         # What standing here takes already is no reason not to leave.
         standing = pin.rnea(self._model, self._data, self._position, still, still)
         bound = np.maximum(self._effort, np.abs(standing)) + _TINY
-        speeds = [*velocities, still]
+        speeds = [*velocities, still, still]
         changes = np.diff([self._moving, *speeds], axis=0) / self.period_s
         torques = [
             pin.rnea(self._model, self._data, position, speed, change)
-            for position, speed, change in zip(path, speeds, changes, strict=True)
+            for position, speed, change in zip([*path, path[-1]], speeds, changes, strict=True)
         ]
         return bool((np.abs(torques) <= bound).all())
 
     def _stays_clear(self, way: list[np.ndarray]) -> bool:
         """Whether the way is free of collisions; out of one that the arm is in, any way is."""
         assert self._is_clear is not None
-        ends = way if len(way) == 1 else [way[0], way[-1]]
-        return all(map(self._is_clear, ends)) or not self._is_clear(self._position)
+        return all(map(self._is_clear, way)) or not self._is_clear(self._position)
 
     def _tool_in_task(self, path: np.ndarray) -> np.ndarray:
         """Return (N, 3) m for (N, J) rad."""

@@ -4,6 +4,7 @@
 """
 
 import os
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -123,6 +124,50 @@ def test_no_posture_collides_and_no_torque_is_too_high(driven):
         ]
     )
     assert (np.abs(torques) <= CONFIG.effort_share * limits.effort + SLACK).all()
+
+
+def wander(guard, steps: int, seed: int = 5) -> np.ndarray:
+    """Push joints about at random, a second each way; return the targets (steps + 1, J)."""
+    rng = np.random.default_rng(seed)
+    rows = [guard.position]
+    for step in range(steps):
+        if step % 25 == 0:
+            push = rng.normal(0, 0.1, len(guard.position))
+        rows.append(guard.step(JointCommand(guard.position + push, 0.04)).joint_position)
+    return np.stack(rows)
+
+
+def test_a_low_limit_of_torque_holds_where_it_bites():
+    share = 0.25
+    rows = []
+    for one in (share, 0.9):
+        guard = make_filter("ur3", replace(CONFIG, effort_share=one))
+        guard.start(postures("ur3", 1, np.random.default_rng(3))[0], 0.04)
+        rows.append(wander(guard, 300))
+    model = arm_model("ur3")
+    data, bound = model.createData(), share * joint_limits("ur3").effort
+    highest = []
+    for targets in rows:
+        speed = np.diff(targets, axis=0, prepend=targets[:1]) * HZ
+        change = np.diff(speed, axis=0) * HZ
+        torques = [
+            pin.rnea(model, data, *row) for row in zip(targets, speed[1:], change, strict=False)
+        ]
+        highest.append((np.abs(torques) / bound).max())
+    kept, free = highest
+    assert kept <= 1.0 + SLACK < free
+
+
+@pytest.mark.parametrize("arm", ["ur3", "tiago_left"])
+def test_an_arm_with_room_to_collide_does_not(arm):
+    room = replace(CONFIG, workspace_low_m=(-2.0,) * 3, workspace_high_m=(2.0,) * 3)
+    limits, checker = joint_limits(arm), CollisionChecker(arm)
+    collided = []
+    for clear in (checker.is_clear, None):
+        guard = SafetyFilter(arm, limits, HZ, room, is_clear=clear)
+        guard.start(np.array(get_arm(arm).home), 0.04)
+        collided.append(not all(map(checker.is_clear, wander(guard, 500))))
+    assert collided == [False, True], "with and without the check"
 
 
 def test_the_gripper_keeps_its_range_and_speed(driven):
