@@ -1,0 +1,252 @@
+"""What is believed about the table is the truth, to millimetres, also where none can see it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from eisp_data.errors import RobotError
+from eisp_data.robots import cell
+from eisp_data.robots.estimates import (
+    Estimates,
+    ObjectEstimate,
+    observation_from_estimates,
+    upright,
+)
+from eisp_data.robots.kinematics import kinematics
+from eisp_data.robots.pose import PoseFit
+from eisp_data.robots.robot import JointCommand, Reading
+from eisp_data.robots.tool_history import ToolHistory, ToolState
+from eisp_data.robots.tracker import Tracker
+from eisp_data.robots.tracks import BlockTrack
+from eisp_data.robots.twin.camera import CAMERA, CameraOptions
+from eisp_data.robots.twin.robot import TwinRobot
+from eisp_data.tasks.registry import TASKS, get_task
+
+TICK_S = 0.04
+
+
+class Session:
+    """A twin and its tracker, ticking together."""
+
+    def __init__(self, robot: TwinRobot) -> None:
+        self.robot = robot
+        self.tracker = Tracker(robot.task, robot.calibration, CAMERA, robot.arm)
+        self.target = np.array(cell.HOME_RAD)
+        self.opening_m = robot.limits.gripper_m[1]
+
+    def run(self, ticks: int, blind: bool = False) -> Estimates:
+        """Return what is believed after so many ticks."""
+        for _ in range(ticks):
+            self.robot.command(JointCommand(self.target, self.opening_m))
+            self.robot.wait_until(self.robot.now_s() + TICK_S)
+            frame = None if blind else self.robot.frames().get(CAMERA)
+            estimates = self.tracker.update(self.robot.observe(), frame)
+        return estimates
+
+    def go(self, place: list[float], ticks: int, blind: bool = False) -> Estimates:
+        """Return what is believed after the tool has gone straight to (3,) m."""
+        placed = cell.transform_task_to_base()
+        arm = kinematics("ur3")
+        start = cell.apply(cell.inverse(placed), arm.forward(self.target)[:3, 3])
+        for share in np.linspace(0, 1, ticks + 1)[1:]:
+            there = start + share * (np.array(place) - start)
+            self.target = arm.track(placed @ cell.transform(np.eye(3), there), self.target)
+            estimates = self.run(1, blind)
+        return self.run(3, blind) if ticks else estimates
+
+    def error_m(self, estimates: Estimates, name: str) -> float:
+        """Return how far an estimate is off."""
+        believed = estimates.objects[name].transform_object_to_task[:3, 3]
+        return float(np.linalg.norm(believed - self.robot.referee.object_pose(name)[:3, 3]))
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_everything_on_the_table_is_found_and_the_observation_is_the_simulators(name):
+    with TwinRobot(name, seed=1) as robot:
+        session = Session(robot)
+        estimates = session.run(6)
+        session.tracker.check()
+        assert session.tracker.missing() == []
+        for thing in estimates.objects:
+            assert session.error_m(estimates, thing) < 0.003
+        observation, achieved = observation_from_estimates(robot.task, estimates)
+        truth = robot.referee.state()[None]
+        np.testing.assert_allclose(achieved, robot.task.achieved_goal(truth)[0], atol=0.003)
+        # The orientations among them: within a degree and a half.
+        np.testing.assert_allclose(observation, robot.task.observe(truth)[0], atol=0.025)
+        assert observation.dtype == achieved.dtype == np.float32
+
+
+def test_a_held_block_is_known_for_two_seconds_without_any_image():
+    with TwinRobot(seed=0) as robot:
+        robot.referee.move_block(0, np.array([0.30, 0.0, 0.025]))
+        robot.referee.move_block(1, np.array([0.38, 0.14, 0.025]))
+        robot.referee.move_block(2, np.array([0.38, -0.14, 0.025]))
+        session = Session(robot)
+        session.run(5)
+        session.go([0.30, 0.0, 0.025], 12)
+        session.opening_m = 0.0
+        assert session.run(6).objects["block0"].held
+        session.go([0.30, 0.0, 0.12], 12, blind=True)
+        session.go([0.26, 0.10, 0.12], 20, blind=True)
+        estimates = session.go([0.26, 0.10, 0.030], 18, blind=True)
+        assert robot.referee.object_pose("block0")[1, 3] > 0.09, "it was carried"
+        assert estimates.objects["block0"].age_s > 2.0
+        assert session.error_m(estimates, "block0") < 0.005
+        session.opening_m = 0.08
+        estimates = session.run(6, blind=True)
+        assert not estimates.objects["block0"].held
+        assert session.error_m(estimates, "block0") < 0.005
+        estimates = session.go([0.26, 0.10, 0.10], 8)
+        assert estimates.objects["block0"].age_s < 0.1
+        assert session.error_m(estimates, "block0") < 0.003
+
+
+def test_a_block_that_a_hand_moves_is_believed_within_a_quarter_of_a_second():
+    with TwinRobot(seed=0) as robot:
+        session = Session(robot)
+        session.run(5)
+        robot.referee.move_block(0, np.array([0.36, 0.15, 0.025]), yaw=0.6)
+        assert session.error_m(session.run(6), "block0") < 0.003
+
+
+def test_a_marker_of_no_object_and_a_hidden_block_are_named():
+    with TwinRobot("push4", seed=0) as robot:
+        session = Session(robot)
+        stack = Tracker(get_task("stack"), robot.calibration, CAMERA, "ur3")
+        session.tracker = stack
+        session.run(8)
+        with pytest.raises(RobotError, match=r"unknown marker (18|20).* in view; this task has"):
+            stack.check()
+    with TwinRobot("stack", seed=0) as robot:
+        robot.referee.move_block(1, np.array([0.0, 1.0, 0.025]))
+        session = Session(robot)
+        session.run(4)
+        with pytest.raises(RobotError, match="does not see block1; its markers are 6, 7, 8"):
+            session.tracker.check()
+
+
+def test_a_camera_that_was_moved_is_noticed():
+    with TwinRobot(camera=CameraOptions(mounting_error=1.0), seed=1) as robot:
+        session = Session(robot)
+        session.run(4)
+        with pytest.raises(RobotError, match="pixels from where the calibration has them"):
+            session.tracker.check()
+
+
+def fit_at(place: list[float]) -> PoseFit:
+    pose = cell.transform(np.eye(3), np.array(place))
+    return PoseFit(pose, 0.1, 1e-6 * np.eye(3), 0.0)
+
+
+def tool_at(time_s: float, place: list[float], opening_m: float = 0.08) -> ToolState:
+    pose = cell.transform(np.eye(3), np.array(place, dtype=float))
+    return ToolState(time_s, pose, np.zeros(3), np.zeros(3), opening_m, 0.0)
+
+
+FAR = cell.transform(np.eye(3), np.array([0.3, 0.0, 0.3]))
+
+
+def test_one_image_that_says_something_else_is_not_believed_two_are():
+    track = BlockTrack()
+    for number in range(3):
+        track.see(fit_at([0.3, 0.0, 0.025]), number / 30, FAR, [])
+    track.see(fit_at([0.4, 0.1, 0.025]), 0.1, FAR, [])
+    assert track.pose is not None and track.pose[0, 3] == pytest.approx(0.3)
+    track.see(fit_at([0.3, 0.0, 0.025]), 0.133, FAR, [])
+    track.see(fit_at([0.2, 0.1, 0.025]), 0.166, FAR, [])
+    assert track.pose[0, 3] == pytest.approx(0.3)
+    track.see(fit_at([0.2, 0.1, 0.025]), 0.2, FAR, [])
+    assert track.pose[0, 3] == pytest.approx(0.2)
+
+
+def test_a_block_at_rest_has_no_velocity_and_a_moving_one_has_its_own():
+    track = BlockTrack()
+    rng = np.random.default_rng(0)
+    for number in range(6):
+        track.see(fit_at([0.3 + rng.normal(0, 2e-4), 0.0, 0.025]), number / 30, FAR, [])
+        assert not track.velocity.any()
+    for number in range(6, 12):
+        track.see(fit_at([0.3 + 0.01 * (number - 5), 0.0, 0.025]), number / 30, FAR, [])
+    np.testing.assert_allclose(track.velocity, [0.3, 0.0, 0.0], atol=1e-6)
+
+
+def test_a_block_out_of_sight_is_pushed_by_the_fingers_that_meet_it():
+    track = BlockTrack()
+    track.see(fit_at([0.3, 0.0, 0.025]), 0.0, FAR, [])
+    before = tool_at(0.0, [0.25, 0.0, 0.025], 0.0)
+    for step in range(1, 11):
+        tool = tool_at(0.04 * step, [0.25 + 0.01 * step, 0.0, 0.025], 0.0)
+        track.follow(before.transform_tool_to_task, tool, 0.025)
+        before = tool
+    assert track.pose is not None and track.pose[0, 3] == pytest.approx(0.35 + 0.036, abs=1e-6)
+    assert not track.held
+
+
+def test_fingers_that_pass_a_block_or_open_do_not_hold_it():
+    track = BlockTrack()
+    track.see(fit_at([0.3, 0.0, 0.025]), 0.0, FAR, [])
+    opening = dataclasses.replace(tool_at(0.04, [0.3, 0, 0.025], 0.05), opening_speed_m_s=0.3)
+    track.follow(opening.transform_tool_to_task, opening, 0.025)
+    assert not track.held
+    above = tool_at(0.08, [0.3, 0, 0.09], 0.05)
+    track.follow(above.transform_tool_to_task, above, 0.025)
+    assert not track.held
+    around = tool_at(0.12, [0.3, 0, 0.03], 0.05)
+    track.follow(around.transform_tool_to_task, around, 0.025)
+    assert track.held
+
+
+def test_an_image_is_laid_on_where_the_tool_was_then():
+    arm = kinematics("ur3")
+    history = ToolHistory(arm, cell.inverse(cell.transform_task_to_base()))
+    for tick in range(4):
+        posture = np.array(cell.HOME_RAD) + 0.02 * tick * np.eye(6)[0]
+        history.add(Reading(posture, np.zeros(6), 0.08, TICK_S * tick))
+    here = history.newest.transform_tool_to_task
+    np.testing.assert_allclose(history.at(9.0), here)
+    half = np.array(cell.HOME_RAD) + 0.03 * np.eye(6)[0]
+    expected = cell.inverse(cell.transform_task_to_base()) @ arm.forward(half)
+    np.testing.assert_allclose(history.at(1.5 * TICK_S)[:3, 3], expected[:3, 3], atol=1e-4)
+    assert len(history.since(1.5 * TICK_S)) == 2
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_an_observation_of_estimates_is_laid_out_as_the_tasks(name):
+    task = get_task(name)
+    state, _ = task.reset(np.random.default_rng(3))
+    rng = np.random.default_rng(0)
+    task.qvel(state)[:] = rng.normal(0, 0.1, task.model.nv)
+    qpos, qvel = task.qpos(state), task.qvel(state)
+    qvel[3:5] = qvel[3]
+    tool = ToolState(
+        0.0, cell.transform(np.eye(3), qpos[:3]), qvel[:3], np.zeros(3), 2 * qpos[3], 2 * qvel[3]
+    )
+    objects = {}
+    for block in range(task.blocks):
+        place, speed = 5 + task.fixtures + 7 * block, 5 + task.fixtures + 6 * block
+        pose = cell.transform(np.eye(3), qpos[place : place + 3])
+        spin = qvel[speed + 3 : speed + 6]
+        objects[f"block{block}"] = ObjectEstimate(pose, qvel[speed : speed + 3], spin, 0.0, False)
+    if task.fixtures:
+        with pytest.raises(RobotError, match="drawer has not been seen yet"):
+            observation_from_estimates(task, Estimates(tool, objects))
+        pose = cell.transform(np.eye(3), np.array([-qpos[5], 0.0, 0.0]))
+        objects["drawer"] = ObjectEstimate(pose, np.array([-qvel[5], 0, 0]), np.zeros(3), 0, False)
+    observation, achieved = observation_from_estimates(task, Estimates(tool, objects))
+    np.testing.assert_allclose(observation, task.observe(state[None])[0], atol=1e-6)
+    np.testing.assert_allclose(achieved, task.achieved_goal(state[None])[0], atol=1e-6)
+
+
+def test_a_cube_on_any_face_is_taken_as_upright_and_unturned():
+    import cv2
+
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        yaw = cv2.Rodrigues(np.array([0.0, 0.0, rng.uniform(-0.7, 0.7)]))[0]
+        faces = cv2.Rodrigues(np.pi / 2 * np.eye(3)[rng.integers(3)] * rng.integers(4))[0]
+        sides = cv2.Rodrigues(np.pi / 2 * np.eye(3)[rng.integers(3)] * rng.integers(4))[0]
+        np.testing.assert_allclose(upright(yaw @ faces @ sides), yaw, atol=1e-12)
