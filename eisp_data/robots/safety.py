@@ -130,11 +130,6 @@ class SafetyFilter:
             self._brake()
         return JointCommand(self._position.copy(), self._opening)
 
-    def brake(self) -> JointCommand:
-        """Return the next targets on the way to a stop."""
-        self._brake()
-        return JointCommand(self._position.copy(), self._opening)
-
     def allows(self, joint_position: np.ndarray) -> bool:
         """Whether the arm may stand at (J,) rad: within limits and workspace, and clear."""
         path = joint_position[None]
