@@ -18,6 +18,7 @@ from eisp_data.robots.hand_eye import LEAST_VIEWS, solve_hand_eye
 from eisp_data.robots.kinematics import kinematics
 from eisp_data.robots.markers import table_markers
 from eisp_data.robots.motion import joint_path
+from eisp_data.robots.planning import plan
 from eisp_data.robots.pose import View, fit_pose
 from eisp_data.robots.robot import CameraFrame, JointCommand, Robot
 
@@ -96,7 +97,8 @@ def _postures(robot: Robot, count: int, seed: int) -> Iterator[np.ndarray]:
 
 def _go(robot: Robot, posture: np.ndarray) -> None:
     """Move to (J,) rad, and come to rest."""
-    ways = np.stack([robot.observe().joint_position, posture])
+    here, clear = robot.observe().joint_position, CollisionChecker(robot.arm).is_clear
+    ways = plan(here, posture, robot.limits, clear)
     rest = np.tile(posture, (round(_REST_S * robot.control_hz), 1))
     path = joint_path(ways, robot.limits, robot.control_hz, _SPEED)
     for target in np.concatenate([path, rest]):
