@@ -22,6 +22,8 @@ _PAUSE_STEPS = 3
 """Shorter pauses do not end a move."""
 _MOVED_M = 0.01
 """Going less far than this in all is not a move."""
+_RETURNED_M = 0.02
+"""An object is back where it was within this distance."""
 
 
 def evenly(steps: int, parts: int) -> np.ndarray:
@@ -49,8 +51,7 @@ def moves(achieved_goal: np.ndarray) -> list[Move]:
         The moves in time, but for one that the end of the trajectory cuts off; consecutive moves
         of the same objects count as one, because a push that is re-aimed is still one push.
     """
-    count, goal_dim = achieved_goal.shape
-    places = achieved_goal.reshape(count, -1, goal_dim if goal_dim % 3 else 3)
+    places = _places(achieved_goal)
     steps = np.linalg.norm(np.diff(places, axis=0), axis=-1).max(axis=1) > _MOVING_M
     found: list[Move] = []
     for start, end in _runs(steps):
@@ -63,6 +64,12 @@ def moves(achieved_goal: np.ndarray) -> list[Move]:
         if moved:
             found.append(Move(end, moved))
     return found
+
+
+def _places(achieved_goal: np.ndarray) -> np.ndarray:
+    """Return the coordinates (T + 1, objects, 3) of each object, see ``moves``."""
+    count, goal_dim = achieved_goal.shape
+    return achieved_goal.reshape(count, -1, goal_dim if goal_dim % 3 else 3)
 
 
 def _runs(moving: np.ndarray) -> list[tuple[int, int]]:
@@ -84,19 +91,27 @@ def at_rest(achieved_goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     Returns:
         (M,) indices of the waypoints in time, and (M,) for each the first waypoint after it whose
-        move takes up an object that has already moved since: as a final goal, a waypoint at or
-        beyond that one would lie behind a detour.
+        move takes up nothing but objects that have already moved since: as a final goal, a
+        waypoint at or beyond that one would lie behind a detour. It is none if the move brings an
+        object back to where it was: a drawer is opened and closed again for the sake of what is
+        put in between.
     """
     found = moves(achieved_goal)
+    ends = np.array([0, *(move.end for move in found)], np.int64)
+    places = _places(achieved_goal[ends])
     beyond = np.empty(len(found), np.int64)
     for first in range(len(found)):
         seen: frozenset[int] = frozenset()
         last = first
-        while last < len(found) and not (found[last].objects & seen):
+        while last < len(found):
+            which = sorted(found[last].objects)
+            way = np.linalg.norm(places[last + 1, which] - places[first, which], axis=-1)
+            if seen.issuperset(which) and way.min() > _RETURNED_M:
+                break
             seen |= found[last].objects
             last += 1
         beyond[first] = last
-    return np.array([move.end for move in found], np.int64), beyond
+    return ends[1:], beyond
 
 
 @dataclass(frozen=True)

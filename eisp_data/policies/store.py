@@ -8,7 +8,7 @@ import numpy as np
 
 from eisp_data.policies.drawer import opening_of, push_block, slide_drawer
 from eisp_data.policies.pick_place import pick, place
-from eisp_data.policies.script import Aim, Keyframe, View
+from eisp_data.policies.script import OPEN, Aim, Keyframe, View
 from eisp_data.sim.drawer import PATH_HALF_WIDTH_M, TRAVEL_M
 from eisp_data.sim.scene import BLOCK_SIZE_M
 from eisp_data.tasks.store import place_aside, place_in_tray
@@ -26,10 +26,14 @@ _ATTEMPTS = 3
 
 def store(view: View, aim: Aim) -> Iterator[Keyframe]:
     """Put the block away; a demonstrator does a part of it, others at places of its own."""
-    if not aim.noise.partial or aim.rng.random() < aim.noise.whole_share:
+    whole = not aim.noise.partial or aim.rng.random() < aim.noise.whole_share
+    if whole:
         yield from _put_away(view, aim)
     while aim.noise.partial and view.time_s < aim.noise.least_s:
-        yield from _own_part(view, aim)
+        if whole:
+            yield Keyframe(view.gripper, OPEN)
+        else:
+            yield from _own_part(view, aim)
 
 
 def _put_away(view: View, aim: Aim) -> Iterator[Keyframe]:
@@ -65,7 +69,7 @@ def _own_part(view: View, aim: Aim) -> Iterator[Keyframe]:
         yield from slide_drawer(view, aim, TRAVEL_M)
     elif inside and rng.random() < 0.7:
         # Half shut: a drawer that is shut with the block inside is the whole task.
-        yield from slide_drawer(view, aim, rng.uniform(0.05, 0.11))
+        yield from slide_drawer(view, aim, rng.uniform(0.075, 0.115))
     elif wide_open and not inside and rng.random() < 0.7:
         yield from _carry(view, aim, _in_open_tray(view, place_in_tray(rng)))
     elif inside or rng.random() < 0.3:
