@@ -65,7 +65,7 @@ def draw(
     """Return the (H, W, 3) uint8 image with the goal as discs and the subgoal as cubes of glass."""
     import cv2
 
-    image = np.ascontiguousarray(image)
+    image = image.copy()
     for place, colour in zip(goal.reshape(-1, 3), colours, strict=True):
         middle, side = view.project(np.array([place, place + [0.0, _GOAL_RADIUS_M, 0.0]]))
         radius = max(2, round(float(np.linalg.norm(side - middle))))

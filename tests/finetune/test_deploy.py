@@ -1,0 +1,267 @@
+"""Deployment: what stands between a policy and a robot, what is drawn of it, and who interferes."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from image_samples import skip_without_opengl
+
+from eisp_data.errors import ConfigError
+from eisp_data.robots.calibration import CameraCalibration
+from eisp_data.robots.cell import transform_camera_to_task
+from eisp_data.robots.estimates import Estimates, ObjectEstimate
+from eisp_data.robots.pose import View
+from eisp_data.robots.record_controllers import Decision, Limited, Slowed
+from eisp_data.robots.robot import CameraIntrinsics
+from eisp_data.robots.session_view import Seen, seen
+from eisp_data.robots.tool_history import ToolState
+from eisp_data.sim.scene import BLOCK_SIZE_M, FINGER_TRAVEL_M
+from eisp_data.storage.mcap.reader import McapLog
+from eisp_data.storage.mcap.writer import McapWriter
+from eisp_data.tasks.base import ACTION_SCALE_M
+from eisp_data.tasks.registry import TASKS
+from finetune.config import PolicyConfig
+from finetune.deploy import RESULTS, deploy
+from finetune.deploy_config import DeployConfig
+from finetune.deploy_film import draw, film
+from finetune.deploy_policy import LOOK_FROM_M, Looking
+from finetune.deploy_trace import distance_curve, read_traces
+from finetune.disturb import Hand
+
+STACK = TASKS["stack"]
+BLOCKS_M = np.array([[0.30, -0.10, 0.025], [0.30, 0.0, 0.025], [0.30, 0.10, 0.025]])
+START_NS, SECOND_NS = 1_700_000_000_000_000_000, 1_000_000_000
+
+
+def seen_at(
+    gripper_m: np.ndarray, opening_m: float, at_s: float = 0.0, velocity: float = 0.0
+) -> Seen:
+    pose = np.eye(4)
+    pose[:3, 3] = gripper_m
+    tool = ToolState(at_s, pose, np.full(3, velocity), np.zeros(3), opening_m, 0.0)
+    blocks = {}
+    for number, place in enumerate(BLOCKS_M):
+        there = np.eye(4)
+        there[:3, 3] = place
+        blocks[f"block{number}"] = ObjectEstimate(there, np.zeros(3), np.zeros(3), 0.0, False)
+    return seen(STACK, at_s, Estimates(tool, blocks))
+
+
+class Inner:
+    """Always moves forward by one whole displacement; remembers what it was shown."""
+
+    name = "inner"
+
+    def __init__(self) -> None:
+        self.shown: list[Seen] = []
+        self.at_subgoal, self.replanned = False, 0
+
+    def begin(self, seen: Seen, goal: np.ndarray, seed: int) -> None:
+        self.shown.clear()
+
+    def replan(self) -> None:
+        self.replanned += 1
+
+    def act(self, seen: Seen) -> Decision:
+        self.shown.append(seen)
+        return Decision(np.array([1.0, 0.0, 0.0, -1.0]))
+
+
+def test_a_slowed_policy_sees_its_own_speeds_and_moves_as_far_in_more_time() -> None:
+    inner = Inner()
+    slowed = Slowed(inner, STACK, ticks=3)
+    slowed.begin(seen_at(np.array([0.3, 0, 0.2]), 0.08, at_s=7.0), np.zeros(9), 0)
+    way = np.zeros(3)
+    for tick in range(9):
+        now = seen_at(np.array([0.3, 0, 0.2]), 0.08, at_s=7.0 + 0.04 * tick, velocity=0.1)
+        way += ACTION_SCALE_M * slowed.act(now).action[:3]
+    np.testing.assert_allclose(way, [3 * ACTION_SCALE_M, 0, 0])
+    assert len(inner.shown) == 3
+    np.testing.assert_allclose(inner.shown[1].observation[5:8], 0.3, rtol=1e-6)
+    assert inner.shown[1].state[0] == pytest.approx(7.0 + 0.04)
+
+
+def test_steps_of_a_look_do_not_count_against_the_task() -> None:
+    class Looks(Inner):
+        def act(self, seen: Seen) -> Decision:
+            return replace(super().act(seen), looking=len(self.shown) % 2 == 0)
+
+    limited = Limited(Looks(), steps=5)
+    now = seen_at(np.array([0.3, 0, 0.2]), 0.08)
+    limited.begin(now, np.zeros(9), 0)
+    outcomes = [limited.act(now).outcome for _ in range(11)]
+    assert outcomes == [None] * 10 + ["timeout"]
+
+
+def test_the_arm_withdraws_after_a_subgoal_only_once_it_has_let_go() -> None:
+    inner = Inner()
+    looking = Looking(inner, STACK)
+    held = BLOCKS_M[1]
+    looking.begin(seen_at(held, BLOCK_SIZE_M), np.zeros(9), 0)
+    for step in range(20):
+        inner.at_subgoal = step == 12
+        assert not looking.act(seen_at(held, BLOCK_SIZE_M)).looking
+    place, highest, decision = held.copy(), 0.0, Decision(np.zeros(4))
+    for _ in range(200):
+        decision = looking.act(seen_at(place, 2 * FINGER_TRAVEL_M))
+        if inner.replanned:
+            break
+        if decision.looking:
+            assert decision.action[3] == 1.0
+            place = place + ACTION_SCALE_M * decision.action[:3]
+            highest = max(highest, place[2])
+    assert inner.replanned == 1 and not decision.looking
+    assert highest >= LOOK_FROM_M[2] - 0.02
+
+
+def camera_view() -> View:
+    lens = CameraIntrinsics(640, 480, np.array([[920.0, 0, 319.5], [0, 920.0, 239.5], [0, 0, 1.0]]))
+    return View(CameraCalibration(lens, transform_camera_to_task()), np.eye(4))
+
+
+def test_subgoals_are_drawn_where_the_camera_would_see_them() -> None:
+    view = camera_view()
+    grey = np.full((480, 640, 3), 90, np.uint8)
+    colours = [np.array([255.0, 0.0, 0.0])]
+    drawn = draw(grey, view, np.array([0.30, 0.12, 0.025]), np.array([0.30, 0.0, 0.025]), colours)
+    changed = np.argwhere((drawn != 90).any(axis=2))[:, ::-1]
+    [cube, ball] = view.project(np.array([[0.30, 0.0, 0.025], [0.30, 0.12, 0.025]]))
+    near = np.minimum(
+        np.linalg.norm(changed - cube, axis=1), np.linalg.norm(changed - ball, axis=1)
+    )
+    # Half the diagonal of the cube, from 0.85 m.
+    assert near.max() < 1.1 * 920 * BLOCK_SIZE_M * 0.87 / 0.85
+    for place in (cube, ball):
+        x, y = place.round().astype(int)
+        assert drawn[y, x, 0] > drawn[y, x, 1]
+    assert (grey == 90).all()
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two seconds, one subgoal in each, the goal 0.3 m away and coming nearer by 0.1 m/s."""
+    path = tmp_path_factory.mktemp("deploy") / "session.mcap"
+    goal = np.tile([0.3, 0.0, 0.025], 3)
+    with McapWriter(path) as log:
+        log.event("episode_start", START_NS)
+        log.vector("/desired_goal", goal, START_NS)
+        for tick in range(51):
+            at = START_NS + tick * SECOND_NS // 25
+            off = np.tile([0.0, 0.3 - 0.1 * tick / 25, 0.0], 3)
+            log.vector("/achieved_goal", goal + off, at)
+            log.vector("/subgoal", goal + (0.1 if tick < 25 else 0.0), at)
+        for number in range(60):
+            image = np.full((48, 64, 3), number, np.uint8)
+            log.image("/camera/top/image", image, START_NS + number * SECOND_NS // 30)
+        log.event("episode_end", START_NS + 2 * SECOND_NS)
+    return path
+
+
+def test_distances_and_subgoals_are_read_back_from_a_recording(recording: Path) -> None:
+    [trace] = read_traces(recording)
+    np.testing.assert_allclose(trace.distances_m()[[0, 25, 50]], [0.3, 0.2, 0.1], atol=1e-9)
+    assert len(trace.subgoals) == 2
+    assert trace.subgoal_at(START_NS - 1) is None
+    np.testing.assert_allclose(
+        trace.subgoal_at(START_NS + SECOND_NS // 2), trace.goal + 0.1, atol=1e-9
+    )
+    curve = distance_curve([trace], 0.05)
+    assert curve.startswith("<svg") and "polyline" in curve and "0.05 m" in curve
+
+
+def test_a_film_has_every_image_of_the_episode(recording: Path, tmp_path: Path) -> None:
+    import av
+
+    [trace] = read_traces(recording)
+    count = film(recording, trace, "top", camera_view(), STACK, tmp_path / "film.mp4")
+    assert count == 60
+    with av.open(str(tmp_path / "film.mp4")) as container:
+        assert sum(1 for _ in container.decode(video=0)) == 60
+
+
+def test_the_hand_takes_one_finished_block_away_once_and_to_a_free_place() -> None:
+    pytest.importorskip("pinocchio")
+    from eisp_data.robots.twin.robot import TwinRobot
+
+    referee = TwinRobot("stack").referee
+    for seed in range(5):
+        goal = referee.reset(seed)
+        hand = Hand(referee, STACK)
+        hand.begin(goal, seed)
+        now, decision = seen_at(np.array([0.3, 0, 0.3]), 0.08), Decision(np.zeros(4))
+        for step in range(10):
+            hand(step, now, decision)
+        assert not hand.moved
+        for block, place in enumerate(goal.reshape(-1, 3)):
+            referee.move_block(block, place)
+        for step in range(4):
+            hand(step, now, decision)
+            assert referee.success(goal)
+        for step in range(20):
+            hand(step, now, decision)
+        assert hand.moved
+        away = np.linalg.norm((referee.achieved_goal() - goal).reshape(-1, 3), axis=1)
+        assert (away > 0.05).tolist() == [False, False, True]
+
+
+def config_for(tmp_path: Path, policy: Path | None, **options: object) -> DeployConfig:
+    settings = {"task": "stack", "output_dir": tmp_path / "out", "realtime": False, **options}
+    return DeployConfig(policy=PolicyConfig(policy), **settings)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"task": "push4"}, "is a policy of 'stack', not of 'push4'"),
+        ({"task": None}, "missing --task"),
+        ({"task": "juggle"}, "unknown task 'juggle'"),
+        ({"robot": "ur3", "interference": True}, "only the twin has such a hand"),
+        ({"robot": "ur4"}, "unknown robot 'ur4'; choose one of twin, ur3, tiago"),
+        ({"robot": "ur3"}, "missing --host"),
+        ({"calibration": Path("nowhere.yaml")}, "nowhere.yaml"),
+        ({"episodes": 0}, "--episodes must be at least 1"),
+    ],
+)
+def test_what_cannot_be_deployed_is_one_line(
+    tmp_path: Path, pretrained: Path, options: dict[str, object], said: str
+) -> None:
+    with pytest.raises(ConfigError, match=said) as error:
+        deploy(config_for(tmp_path, pretrained, **options))
+    assert "\n" not in str(error.value)
+
+
+def test_a_policy_on_the_twin_is_recorded_judged_and_goes_on_where_it_stopped(
+    tmp_path: Path, pretrained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    skip_without_opengl()
+    config = config_for(tmp_path, pretrained, episode_s=0.6, seed=3)
+    deploy(config)
+    with pytest.raises(ConfigError, match="add --resume"):
+        deploy(config)
+    deploy(replace(config, episodes=2, resume=True, record_images=False))
+    entries = [json.loads(line) for line in (config.output_dir / RESULTS).read_text().splitlines()]
+    assert [entry["seed"] for entry in entries] == [3, 4]
+    assert all(entry["outcome"] == "timeout" and not entry["success"] for entry in entries)
+    out = capsys.readouterr().out
+    assert "success, by the twin's referee: 0 [0, 0.658] of 2 episodes" in out
+    assert (config.output_dir / "episode_0000.mp4").exists()
+    with McapLog(config.output_dir / "session_0000.mcap") as log:
+        assert log.indexed and not log.problems
+        assert log.stats()["/action"].count == 15
+        assert {"/subgoal", "/camera/top/image", "/joint_command"} <= set(log.topics)
+
+
+def test_an_unreachable_goal_is_refused_before_anything_moves(
+    tmp_path: Path, pretrained: Path
+) -> None:
+    skip_without_opengl()
+    from eisp_data.errors import RobotError
+
+    goal = (0.3, 0.0, 0.025, 0.3, 0.0, 0.075, 0.9, 0.0, 0.125)
+    with pytest.raises(RobotError, match="unreachable goal"):
+        deploy(config_for(tmp_path, pretrained, goal=goal))
+    assert not list((tmp_path / "out").glob("*.mcap"))
