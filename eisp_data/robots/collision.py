@@ -18,6 +18,10 @@ from eisp_data.robots.models import models_folder
 TABLE_MARGIN_M = 0.005
 """No link comes nearer to the table; the fingertips may, see the workspace in ``safety``."""
 
+CLEARANCE_M = 0.003
+"""Parts this near count as meeting: the search for the nearest points of two hulls is not exact
+where they just touch."""
+
 _GRIPPER_HALF_M = (0.03, 0.06)
 """Of the box around the gripper, across and along the way that the fingers open."""
 _FINGERS_M = 0.04
@@ -28,13 +32,19 @@ _POSTURES = 300
 class CollisionChecker:
     """Checks postures of one arm; the other joints of the robot are held."""
 
-    def __init__(self, arm: str, transform_task_to_base: np.ndarray | None = None) -> None:
+    def __init__(
+        self,
+        arm: str,
+        transform_task_to_base: np.ndarray | None = None,
+        clearance_m: float = CLEARANCE_M,
+    ) -> None:
         """Load the meshes.
 
         Args:
             arm: a name in ``ARMS``.
             transform_task_to_base: (4, 4) of a frame that lies on the table top, z up; the arm's
                 usual one if left out.
+            clearance_m: parts nearer than this count as meeting.
         """
         spec, self._model = get_arm(arm), arm_model(arm)
         placed = spec.transform_task_to_base
@@ -45,12 +55,21 @@ class CollisionChecker:
         self._geometry = self._geometry.copy()
         self._add_table(placed, pairs)
         self._geometry_data = self._geometry.createData()
+        for request in self._geometry_data.collisionRequests:
+            request.security_margin = clearance_m
 
     def is_clear(self, joint_position: np.ndarray) -> bool:
         """Whether the arm at (J,) rad meets neither itself nor the table."""
         return not pin.computeCollisions(
             self._model, self._data, self._geometry, self._geometry_data, joint_position, True
         )
+
+    def distance_m(self, joint_position: np.ndarray) -> float:
+        """Return how far apart the nearest two parts are at (J,) rad; below 0 they overlap."""
+        pin.computeDistances(
+            self._model, self._data, self._geometry, self._geometry_data, joint_position
+        )
+        return min(result.min_distance for result in self._geometry_data.distanceResults)
 
     def meets(self, joint_position: np.ndarray) -> list[tuple[str, str]]:
         """Return the names of the links that meet at (J,) rad."""

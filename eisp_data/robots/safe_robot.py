@@ -49,11 +49,11 @@ class SafeRobot(Robot):
         self._robot, self.dry_run = robot, dry_run
         self.name, self.arm, self.joint_names = robot.name, robot.arm, robot.joint_names
         self.control_hz, self.limits, self.cameras = robot.control_hz, robot.limits, robot.cameras
-        clear = None
+        collisions = None
         if config.check_collisions:
-            clear = CollisionChecker(robot.arm, transform_task_to_base).is_clear
+            collisions = CollisionChecker(robot.arm, transform_task_to_base)
         self.filter = SafetyFilter(
-            robot.arm, robot.limits, robot.control_hz, config, transform_task_to_base, clear
+            robot.arm, robot.limits, robot.control_hz, config, transform_task_to_base, collisions
         )
         self._fault: str | None = "not connected"
         self._reading: Reading | None = None

@@ -9,8 +9,8 @@ hold at every control period. Where the arm starts outside a limit it may only c
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -18,6 +18,9 @@ import pinocchio as pin
 from eisp_data.robots.arms import arm_model, get_arm
 from eisp_data.robots.robot import JointCommand, JointLimits
 from eisp_data.sim.scene import WORKSPACE_HIGH_M, WORKSPACE_LOW_M
+
+if TYPE_CHECKING:
+    from eisp_data.robots.collision import CollisionChecker
 
 _TINY = 1e-9
 _BLENDS = (1.0, 0.6, 0.3, 0.1)
@@ -70,7 +73,7 @@ class SafetyFilter:
         control_hz: float,
         config: SafetyConfig | None = None,
         transform_task_to_base: np.ndarray | None = None,
-        is_clear: Callable[[np.ndarray], bool] | None = None,
+        collisions: CollisionChecker | None = None,
     ) -> None:
         """Prepare; call ``start`` first.
 
@@ -80,7 +83,7 @@ class SafetyFilter:
             control_hz: how often ``step`` is called.
             config: the default one if left out.
             transform_task_to_base: (4, 4), the arm's usual one if left out.
-            is_clear: whether a posture (J,) is free of collisions; left out, none is looked for.
+            collisions: what looks for them; left out, nothing does.
         """
         spec, self._model = get_arm(arm), arm_model(arm)
         self.config = config or SafetyConfig()
@@ -99,7 +102,7 @@ class SafetyFilter:
         self._velocity = self.config.velocity_share * limits.velocity
         self._change = self.config.acceleration_share * limits.acceleration * self.period_s
         self._effort = self.config.effort_share * limits.effort
-        self._is_clear = is_clear
+        self._collisions = collisions
         self.start(np.zeros(self._model.nv), limits.gripper_m[1])
 
     def start(self, joint_position: np.ndarray, gripper_opening_m: float) -> None:
@@ -134,7 +137,9 @@ class SafetyFilter:
         """Whether the arm may stand at (J,) rad: within limits and workspace, and clear."""
         path = joint_position[None]
         outside = self._outside(path, self._tool_in_task(path))[0]
-        return outside <= 0.0 and (self._is_clear is None or self._is_clear(joint_position))
+        return outside <= 0.0 and (
+            self._collisions is None or self._collisions.is_clear(joint_position)
+        )
 
     @property
     def stopped(self) -> bool:
@@ -198,7 +203,7 @@ class SafetyFilter:
         if not self._within_effort(path, velocities):
             return None
         way = list(path[1:])
-        return way if self._is_clear is None or self._stays_clear(way) else None
+        return way if self._stays_clear(way) else None
 
     def _braking_velocities(self, velocity: np.ndarray) -> np.ndarray:
         """Return (N, J): that velocity, then less and less of it, as fast as the joints may."""
@@ -228,9 +233,14 @@ class SafetyFilter:
         return bool((np.abs(torques) <= bound).all())
 
     def _stays_clear(self, way: list[np.ndarray]) -> bool:
-        """Whether the way is free of collisions; out of one that the arm is in, any way is."""
-        assert self._is_clear is not None
-        return all(map(self._is_clear, way)) or not self._is_clear(self._position)
+        """Whether the way is free of collisions, or leads out of the one that the arm is in."""
+        checker = self._collisions
+        if checker is None or all(map(checker.is_clear, way)):
+            return True
+        if checker.is_clear(self._position):
+            return False
+        apart = [checker.distance_m(posture) for posture in (self._position, *way)]
+        return bool((np.diff(apart) > 0.0).all())
 
     def _tool_in_task(self, path: np.ndarray) -> np.ndarray:
         """Return (N, 3) m for (N, J) rad."""

@@ -28,7 +28,7 @@ NASTY = np.array([np.nan, np.inf, -np.inf, 1e300, -1e300, 5.0, 0.0])
 
 
 def make_filter(arm: str, config: SafetyConfig = CONFIG) -> SafetyFilter:
-    return SafetyFilter(arm, joint_limits(arm), HZ, config, is_clear=CollisionChecker(arm).is_clear)
+    return SafetyFilter(arm, joint_limits(arm), HZ, config, collisions=CollisionChecker(arm))
 
 
 def postures(arm: str, count: int, rng) -> np.ndarray:
@@ -110,7 +110,7 @@ def test_the_tool_keeps_to_its_workspace_and_speed(driven):
 
 def test_no_posture_collides_and_no_torque_is_too_high(driven):
     arm, targets, _ = driven
-    model, checker = arm_model(arm), CollisionChecker(arm)
+    model, checker = arm_model(arm), CollisionChecker(arm, clearance_m=0.0)
     data, limits = model.createData(), joint_limits(arm)
     some = targets[:: max(1, len(targets) // 20)]
     assert all(checker.is_clear(joints) for row in some for joints in row)
@@ -161,10 +161,10 @@ def test_a_low_limit_of_torque_holds_where_it_bites():
 @pytest.mark.parametrize("arm", ["ur3", "tiago_left"])
 def test_an_arm_with_room_to_collide_does_not(arm):
     room = replace(CONFIG, workspace_low_m=(-2.0,) * 3, workspace_high_m=(2.0,) * 3)
-    limits, checker = joint_limits(arm), CollisionChecker(arm)
+    limits, checker = joint_limits(arm), CollisionChecker(arm, clearance_m=0.0)
     collided = []
-    for clear in (checker.is_clear, None):
-        guard = SafetyFilter(arm, limits, HZ, room, is_clear=clear)
+    for collisions in (CollisionChecker(arm), None):
+        guard = SafetyFilter(arm, limits, HZ, room, collisions=collisions)
         guard.start(np.array(get_arm(arm).home), 0.04)
         collided.append(not all(map(checker.is_clear, wander(guard, 500))))
     assert collided == [False, True], "with and without the check"

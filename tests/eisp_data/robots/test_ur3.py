@@ -13,7 +13,10 @@ import pytest
 
 from eisp_data.errors import RobotError
 from eisp_data.robots.arms import get_arm
+from eisp_data.robots.motion import CartesianServo
 from eisp_data.robots.robot import JointCommand
+from eisp_data.robots.safe_robot import SafeRobot
+from eisp_data.robots.safety import SafetyConfig
 
 pytest.importorskip("rtde_control")
 from eisp_data.robots.ur3 import Ur3Robot
@@ -88,6 +91,23 @@ def test_the_arm_goes_where_it_is_led_and_stays_there(ur3, controller):
     soon(lambda: abs(ur3.observe().gripper_opening_m - 0.04) < 0.001)
     np.testing.assert_allclose(controller.joints(), target, atol=1e-6)
     assert 0.0 <= ur3.now_s() - ur3.observe().hardware_s < 1.0
+
+
+def test_a_policy_behind_the_filter_moves_the_tool_its_way(controller):
+    # A machine that runs tests may be slow.
+    patient = SafetyConfig(stale_s=5.0, following_rad=3.0)
+    with SafeRobot(Ur3Robot(HOST), patient) as robot:
+        servo = CartesianServo(robot.arm, robot.control_hz)
+        sent = robot.observe().joint_position
+        start = servo.tool_in_task(sent)
+        for _ in range(15):
+            due_s = robot.now_s() + 1 / robot.control_hz
+            robot.observe()
+            sent = robot.command(servo.step(np.array([0.1, 0.1, 0.0, 1.0]), sent)).joint_position
+            robot.wait_until(due_s)
+        soon(lambda: np.allclose(controller.joints(), sent, atol=1e-6))
+    moved = servo.tool_in_task(sent) - start
+    np.testing.assert_allclose(moved, [0.06, 0.06, 0.0], atol=0.01)
 
 
 def test_what_was_really_sent_to_the_gripper_is_one_of_its_steps(ur3):
