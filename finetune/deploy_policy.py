@@ -6,7 +6,7 @@ import numpy as np
 
 from eisp_data.robots.record_controllers import Decision
 from eisp_data.robots.session_view import Seen
-from eisp_data.tasks.base import ACTION_SCALE_M, Task
+from eisp_data.tasks.base import ACTION_SCALE_M, Task, is_success
 from finetune.rollout import SubgoalPolicy
 from pretrain.agent import Agent
 
@@ -23,6 +23,9 @@ _FRESH_S = 0.15
 _LONGEST_LOOK_STEPS = 25
 _SHORTEST_STEPS = 10
 """A subgoal that is reached sooner, because it was all but reached before, is worth no look."""
+_CLINGING_STEPS = 25
+"""What is at its goal and has been held there for so long is let go of."""
+_OPEN_M = 0.06
 _OFF_STEPS = 3
 """Hands are off once they have been for so many steps."""
 
@@ -72,12 +75,13 @@ class Looking:
         self.name = inner.name
         self._inner, self._task = inner, task
         self._legs: list[np.ndarray] = []
-        self._steps = self._off = self._since = 0
-        self._due = False
+        self._steps = self._off = self._since = self._clung = 0
+        self._due, self._goal = False, np.empty(0)
 
     def begin(self, seen: Seen, goal: np.ndarray, seed: int) -> None:
         """Start an episode."""
-        self._legs, self._steps, self._off, self._since, self._due = [], 0, 0, 0, False
+        self._legs, self._due, self._goal = [], False, goal
+        self._steps = self._off = self._since = self._clung = 0
         self._inner.begin(seen, goal, seed)
 
     def act(self, seen: Seen) -> Decision:
@@ -89,9 +93,11 @@ class Looking:
         self._due |= self._inner.at_subgoal and self._since >= _SHORTEST_STEPS
         hands_off = self._task.fingers_closed or bool(self._task.hands_off(seen.state[None])[0])
         self._off = self._off + 1 if hands_off else 0
-        if not self._due or self._off < _OFF_STEPS:
+        met = bool(is_success(seen.achieved_goal, self._goal))
+        self._clung = self._clung + 1 if met and not hands_off else 0
+        if self._clung < _CLINGING_STEPS and not (self._due and self._off >= _OFF_STEPS):
             return decision
-        self._due, self._since = False, 0
+        self._due, self._since, self._clung = False, 0, 0
         here = seen.gripper_m
         up = np.array([here[0], here[1], max(here[2] + _LEAVE_UP_M, LOOK_FROM_M[2])])
         self._legs = [up, np.array(LOOK_FROM_M), np.array(_READY_M)]
@@ -99,7 +105,13 @@ class Looking:
         return self._leave(seen)
 
     def _leave(self, seen: Seen) -> Decision:
-        """Go on along the way out, look, and come back."""
+        """Let go, go on along the way out, look, and come back."""
+        closed = self._task.fingers_closed
+        fingers = -1.0 if closed else 1.0
+        opening = seen.estimates.tool.opening_m
+        if not closed and opening < _OPEN_M and self._steps < _LONGEST_LEG_STEPS:
+            self._steps += 1
+            return Decision(np.array([0.0, 0.0, 0.0, fingers]), looking=True)
         way = self._legs[0] - seen.gripper_m
         there = np.linalg.norm(way) < _NEAR_M or self._steps >= _LONGEST_LEG_STEPS
         looks = len(self._legs) == 2
@@ -111,6 +123,5 @@ class Looking:
             if not self._legs:
                 self._inner.replan()
                 return self.act(seen)
-        fingers = -1.0 if self._task.fingers_closed else 1.0
         motion = np.clip(way / ACTION_SCALE_M, -_LEAVE_SPEED, _LEAVE_SPEED)
         return Decision(np.append(motion, fingers), looking=True)

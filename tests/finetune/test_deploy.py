@@ -118,6 +118,17 @@ def test_the_arm_withdraws_after_a_subgoal_only_once_it_has_let_go() -> None:
     assert highest >= LOOK_FROM_M[2] - 0.02
 
 
+def test_what_is_at_its_goal_and_held_there_is_let_go_of() -> None:
+    looking = Looking(Inner(), STACK)
+    held = seen_at(BLOCKS_M[1], BLOCK_SIZE_M)
+    looking.begin(held, held.achieved_goal, 0)
+    decisions = [looking.act(held) for _ in range(40)]
+    first = next(step for step, decision in enumerate(decisions) if decision.looking)
+    assert 20 <= first <= 30
+    # It opens before it rises.
+    np.testing.assert_allclose(decisions[first].action, [0.0, 0.0, 0.0, 1.0])
+
+
 def camera_view() -> View:
     lens = CameraIntrinsics(640, 480, np.array([[920.0, 0, 319.5], [0, 920.0, 239.5], [0, 0, 1.0]]))
     return View(CameraCalibration(lens, transform_camera_to_task()), np.eye(4))

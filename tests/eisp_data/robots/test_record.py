@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from bench_robot import BenchRobot
 from hand_on_device import HandOnGamepad, HandOnKeyboard
+from image_samples import skip_without_opengl
 
 from eisp_data.errors import ConfigError, EispError, RobotError
 from eisp_data.robots import registry, teleop
@@ -20,6 +21,7 @@ from eisp_data.storage.lerobot import read_episodes
 from eisp_data.storage.mcap.convert import ConvertConfig, convert
 from eisp_data.storage.mcap.reader import McapLog
 from eisp_data.storage.mcap.windows import cut
+from eisp_data.tasks.registry import TASKS
 
 PERIOD_S = 0.04
 
@@ -189,6 +191,32 @@ def test_a_dry_run_commands_nothing(
     report = record(recorded(tmp_path, dry_run=True))
     assert not bench.made[0].sent and bench.made[0].standing
     assert end_of(report.output)[2] == 10
+
+
+def test_a_script_on_the_twin_becomes_a_dataset_in_the_layout_of_its_task(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("pinocchio")
+    skip_without_opengl()
+    # A hand that has the gamepad's button down from the start: what it does is an intervention.
+    hand_on(monkeypatch, HandOnGamepad(reads=100, takes_over=True))
+    options = {"task": "stack", "realtime": False, "episode_s": 0.4, "seed": 7}
+    record(RecordConfig(output=tmp_path / "a.mcap", **options))
+    watched = RecordConfig(output=tmp_path / "b.mcap", watch="gamepad", **options)
+    record(watched)
+    convert(ConvertConfig(inputs=(tmp_path / "a.mcap", watched.output), to=tmp_path / "data"))
+    alone, helped = read_episodes(tmp_path / "data")
+    for episode in (alone, helped):
+        assert episode.observation.shape == (11, 55) and episode.action.shape == (10, 4)
+        assert episode.info["outcome"] == "timeout" and episode.info["task"] == "stack"
+    # Perceived, not given: near the true start of that seed, but not the same to the digit.
+    true_blocks = TASKS["stack"].block_positions(
+        TASKS["stack"].reset(np.random.default_rng(7))[0][None]
+    )
+    off = np.linalg.norm(alone.achieved_goal[0].reshape(3, 3) - true_blocks[0], axis=1)
+    assert (off > 0).all() and (off < 0.008).all()
+    assert (alone.info["interventions"], helped.info["interventions"]) == (0, 1)
+    np.testing.assert_allclose(helped.action[:, 3], -1.0)
 
 
 @pytest.mark.parametrize(
