@@ -23,7 +23,7 @@ _HUBER = 3.0
 _STEPS = 12
 _CONVERGED = 1e-5
 """rad and m."""
-_MOST_PX = 2.0
+_MOST_PX = 1.2
 """A fit with a larger error is none."""
 _GOOD_PX = 0.35
 """A guess that leads to a fit so good needs no rival."""

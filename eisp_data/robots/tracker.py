@@ -22,7 +22,7 @@ from eisp_data.tasks.base import Task
 _TILT_STD, _HEIGHT_STD_M = 0.01, 0.0007
 """Of a block that stands on something."""
 _UPRIGHT_PX = 0.5
-"""A block that fits worse than this standing upright does not."""
+"""A block that fits better than this standing upright does so."""
 _ANY_TILT_STD = 0.5
 """Of one that does not: it only says which of two mirror images it is."""
 _HELD_TILT_STD = 0.1
@@ -167,7 +167,10 @@ class Tracker:
             return fit_pose(self._view, item, rays, guess, Priors(_HELD_TILT_STD))
         fit = fit_pose(self._view, item, rays, guess, Priors(_TILT_STD))
         if fit is None or fit.error_px > _UPRIGHT_PX:
-            return fit_pose(self._view, item, rays, guess, Priors(_ANY_TILT_STD))
+            tilted = fit_pose(self._view, item, rays, guess, Priors(_ANY_TILT_STD))
+            # Freedom to tilt makes up for wrong corners, too: it has to explain much.
+            if fit is None or (tilted is not None and tilted.error_px < 0.5 * fit.error_px):
+                return tilted
         pose = fit.transform_object_to_task
         slack = max(_STANDS_M, _STANDS_STD * fit.position_std_m)
         heights = [height + HALF_M for height in self._surfaces(name, pose)]
@@ -176,7 +179,8 @@ class Tracker:
             return fit
         priors = Priors(_TILT_STD, height, _HEIGHT_STD_M)
         standing = fit_pose(self._view, item, rays, pose, priors)
-        return fit if standing is None or standing.error_px > _UPRIGHT_PX else standing
+        stands = standing is not None and standing.error_px < max(_UPRIGHT_PX, 1.5 * fit.error_px)
+        return standing if stands else fit
 
     def _surfaces(self, name: str, pose: np.ndarray) -> list[float]:
         """Return the heights (m) of all that a block may stand on where it is."""

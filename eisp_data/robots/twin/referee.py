@@ -47,7 +47,7 @@ class Referee:
     def state(self) -> np.ndarray:
         """Return the task's state (P,), as its own scene would have it."""
         with self._lock:
-            data, task = self._world.data, self._task
+            data, task = self._current(), self._task
             state = np.zeros(1 + task.model.nq + task.model.nv)
             state[0] = data.time
             qpos, qvel = task.qpos(state), task.qvel(state)
@@ -83,7 +83,7 @@ class Referee:
         with self._lock:
             if name == "table":
                 return np.eye(4)
-            data = self._world.data
+            data = self._current()
             place = data.site(TOOL) if name == "gripper" else data.body(name)
             rotation = place.xmat.reshape(3, 3)
             return cell.transform(rotation, place.xpos)
@@ -101,6 +101,14 @@ class Referee:
         """Put the blocks out of the way, at the far end of the table."""
         for block in range(self._task.blocks):
             self.move_block(block, np.array([0.62, -0.3 + 0.15 * block, BLOCK_SIZE_M / 2]))
+
+    def _current(self) -> mujoco.MjData:
+        """Return the data, its poses brought up to the joints: a step leaves them one behind."""
+        model, data = self._world.model, self._world.data
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_comVel(model, data)
+        return data
 
     def _set_objects(self, state: np.ndarray) -> None:
         qpos, data = self._task.qpos(state), self._world.data
