@@ -14,7 +14,7 @@ from finetune.rollout import SubgoalPolicy
 from pretrain.agent import Agent
 from pretrain.hindsight import at_rest
 
-_LETTING_GO = np.float32([[0, 0, 0, OPEN]] * 4 + [[0, 0, 1, OPEN]] * 2)
+_LETTING_GO = np.array([[0, 0, 0, OPEN]] * 4 + [[0, 0, 1, OPEN]] * 2, np.float32)
 """A script expects nothing in the gripper that begins it."""
 _NEARER_M = 0.01
 _LOOKAHEAD_STEPS = 80

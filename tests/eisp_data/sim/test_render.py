@@ -83,7 +83,7 @@ def test_the_env_renders_and_renders_nothing_without_a_mode():
 
 
 def test_an_unknown_camera_is_named_with_the_choices():
-    with pytest.raises(ConfigError, match="unknown camera 'side'; choose one of front, top, shoulder"):
+    with pytest.raises(ConfigError, match="unknown camera 'side'; choose one of front, top"):
         Renderer(get_task("stack"), "side")
 
 
