@@ -23,10 +23,13 @@ class SubgoalPolicy:
         self._config = agent.config.subgoals
         self.subgoal = np.zeros((worlds, agent.layout.goal_dim), np.float32)
         self.age = np.full(worlds, self._config.every_steps)
+        self._start = np.full_like(self.subgoal, np.inf)
+        self._stuck = np.zeros(worlds, bool)
 
     def reset(self, worlds: np.ndarray) -> None:
         """Forget the subgoals of the named worlds."""
         self.age[worlds] = self._config.every_steps
+        self._start[worlds] = np.inf
 
     def reached(self, achieved_goal: np.ndarray) -> np.ndarray:
         """Return whether each world is at its subgoal, (N,) bool, of (N, G) achieved goals."""
@@ -52,8 +55,10 @@ class SubgoalPolicy:
         Returns:
             (N, A) float32 in [-1, 1].
         """
-        renew = np.flatnonzero(self.reached(achieved_goal) | (self.age >= self._config.every_steps))
+        reached = self.reached(achieved_goal)
+        renew = np.flatnonzero(reached | (self.age >= self._config.every_steps))
         if len(renew):
+            self._notice_stuck(renew, reached, achieved_goal)
             chosen = self._choose(
                 renew, observation[renew], achieved_goal[renew], desired_goal[renew]
             )
@@ -61,10 +66,28 @@ class SubgoalPolicy:
             self.subgoal[renew] = np.where(near[:, None], desired_goal[renew], chosen)
             self.age[renew] = 0
         self.age += 1
-        action = self._agent.sac.act(
-            self._tensor(observation), self._tensor(self.subgoal), explore=explore
-        )
-        return action.cpu().numpy()
+        action = self._act(observation, self.subgoal, explore)
+        stuck = np.flatnonzero(self._stuck)
+        if len(stuck) and not explore:
+            action[stuck] = self._act(observation[stuck], self.subgoal[stuck], True)
+        return action
+
+    def _act(self, observation: np.ndarray, subgoal: np.ndarray, explore: bool) -> np.ndarray:
+        seen, target = self._tensor(observation), self._tensor(subgoal)
+        return self._agent.sac.act(seen, target, explore=explore).cpu().numpy()
+
+    def _notice_stuck(
+        self, renew: np.ndarray, reached: np.ndarray, achieved_goal: np.ndarray
+    ) -> None:
+        """Mark the worlds in which a subgoal was not reached and nothing has moved for its sake.
+
+        A policy without noise that has come to a standstill stays there. Its own noise frees it:
+        until the next subgoal its actions are sampled.
+        """
+        way = np.abs(achieved_goal[renew] - self._start[renew]).max(axis=1)
+        still = way < self._config.reached_m / 2
+        self._stuck[renew] = still & ~reached[renew] & self._config.sample_when_stuck
+        self._start[renew] = achieved_goal[renew]
 
     def _choose(
         self,

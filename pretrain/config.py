@@ -81,6 +81,8 @@ class SubgoalConfig:
     """A subgoal is reached within this distance (the paper's epsilon)."""
     final_m: float = 0.05
     """A subgoal this near to the final goal gives way to it (the paper's epsilon)."""
+    sample_when_stuck: bool = True
+    """Sample the actions towards a subgoal, if for the sake of the last one nothing moved."""
 
 
 @dataclass(frozen=True)

@@ -101,6 +101,7 @@ def _paper(task: str, root: Path, output_dir: Path) -> PretrainConfig:
                 candidates=16,  # the paper does not give K
                 every_steps=table.subgoal_steps,
                 reached_m=SUCCESS_DISTANCE_M,
+                sample_when_stuck=False,
             ),
             mix=GoalMix(waypoint=0.0, future=1.0, displaced=0.0, horizon=table.episode_steps),
         ),

@@ -117,3 +117,30 @@ def test_actions_are_float32_within_bounds_and_head_for_the_subgoal(explore):
     assert action.shape == (2, 1) and action.dtype == np.float32
     np.testing.assert_allclose(action, np.tanh(1.0), atol=0.05 if explore else 1e-6)
     assert (np.abs(action) <= 1).all()
+
+
+def test_a_policy_at_a_standstill_samples_its_actions_until_something_moves():
+    policy = counting_policy()
+    still, moving = np.zeros(2, np.float32), np.array([0.5, 0.0], np.float32)
+    means = [step(policy) for _ in range(5)]
+    assert all((action == means[0]).all() for action in means)
+    # World 1 has moved half a metre when its subgoal is renewed, world 0 has not.
+    sampled = np.stack([step(policy, np.stack([still, moving])) for _ in range(5)])
+    assert (sampled[:, 1] == means[0][1]).all() and sampled[:, 0].std() > 0.01
+    moved = np.stack([step(policy, np.stack([moving, moving + 1.0])) for _ in range(3)])
+    assert (moved == moved[0]).all()
+
+
+def test_after_a_reset_nobody_is_stuck():
+    policy = counting_policy()
+    for _ in range(10):
+        step(policy)
+    policy.reset(np.arange(2))
+    first = step(policy)
+    assert (first == step(policy)).all()
+
+
+def test_a_policy_may_be_told_to_stay_without_noise():
+    policy = counting_policy(sample_when_stuck=False)
+    actions = [step(policy) for _ in range(12)]
+    assert all((action == actions[0]).all() for action in actions)
