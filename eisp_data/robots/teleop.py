@@ -5,7 +5,7 @@ what      keyboard                               gamepad
 ========  =====================================  ==================================
 move      arrow keys                             left stick
 up, down  right shift, left shift                right stick
-fingers   right ctrl opens, left ctrl closes     LT opens, RB closes
+fingers   right ctrl opens, left ctrl closes     RT opens, LT closes
 outcome   s success, q failure, r record again   Y success, A failure, X again
 take over any of the keys that move              RB (or R1)
 ========  =====================================  ==================================
