@@ -109,7 +109,8 @@ def deploy(config: DeployConfig) -> None:
     try:
         run_session(config, _plan(run), run.controller, report, run.watch, run.after)
     finally:
-        print("\n".join(report.lines()))
+        for line in report.lines():
+            print(line)
         if report.stats is not None:
             _draw(run)
     print("\n".join(_verdict(config)))

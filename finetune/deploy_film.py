@@ -20,7 +20,7 @@ _GOAL_RADIUS_M = 0.013
 _FACE_ALPHA = 0.35
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 _EDGES = [(a, b) for a in range(8) for b in range(a) if (_CORNERS[a] != _CORNERS[b]).sum() == 1]
-_FPS = 30
+_FPS, _SECOND_NS = 30, 1_000_000_000
 
 
 def film(recording: Path, trace: Trace, camera: str, view: View, task: Task, to: Path) -> int:
@@ -42,6 +42,7 @@ def _frames(
 ) -> Iterator[np.ndarray]:
     colours = [255 * colour for colour in object_colours(task)]
     decoder = decode.Decoder()
+    shown, last = 0, None
     with McapLog(recording) as log:
         for entry in log.messages({f"/camera/{camera}/image"}):
             at = entry.message.publish_time_ns
@@ -52,7 +53,14 @@ def _frames(
             )
             assert isinstance(picture, decode.Picture)
             image = pixels.rgb(picture)
-            yield draw(image, view, trace.goal, trace.subgoal_at(at), colours)
+            drawn = draw(image, view, trace.goal, trace.subgoal_at(at), colours)
+            # Where images were lost the last one stays: a film lasts as long as the episode.
+            due = 1 + round((at - trace.start_ns) * _FPS / _SECOND_NS)
+            for _ in range(shown + 1, due):
+                yield drawn if last is None else last
+            if due > shown:
+                yield drawn
+            shown, last = max(due, shown), drawn
 
 
 def draw(

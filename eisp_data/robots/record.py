@@ -61,7 +61,8 @@ def record(config: RecordConfig) -> Report:
     try:
         run_session(config, plan(config), lambda cell: controller(config, cell), report)
     finally:
-        print("\n".join(report.lines()))
+        for line in report.lines():
+            print(line)
     return report
 
 

@@ -165,7 +165,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
             off = np.tile([0.0, 0.3 - 0.1 * tick / 25, 0.0], 3)
             log.vector("/achieved_goal", goal + off, at)
             log.vector("/subgoal", goal + (0.1 if tick < 25 else 0.0), at)
-        for number in range(60):
+        for number in (n for n in range(60) if not 20 <= n < 30):
             image = np.full((48, 64, 3), number, np.uint8)
             log.image("/camera/top/image", image, START_NS + number * SECOND_NS // 30)
         log.event("episode_end", START_NS + 2 * SECOND_NS)
@@ -184,7 +184,9 @@ def test_distances_and_subgoals_are_read_back_from_a_recording(recording: Path) 
     assert curve.startswith("<svg") and "polyline" in curve and "0.05 m" in curve
 
 
-def test_a_film_has_every_image_of_the_episode(recording: Path, tmp_path: Path) -> None:
+def test_a_film_lasts_as_long_as_its_episode_also_where_images_were_lost(
+    recording: Path, tmp_path: Path
+) -> None:
     import av
 
     [trace] = read_traces(recording)
