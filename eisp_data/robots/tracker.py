@@ -23,6 +23,8 @@ _TILT_STD, _HEIGHT_STD_M = 0.01, 0.0007
 """Of a block that stands on something."""
 _UPRIGHT_PX = 0.5
 """A block that fits better than this standing upright does so."""
+_FLYING_PX = 0.35
+"""A block that nothing holds and nothing carries has to fit as well as this."""
 _ANY_TILT_STD = 0.5
 """Of one that does not: it only says which of two mirror images it is."""
 _HELD_TILT_STD = 0.1
@@ -176,7 +178,8 @@ class Tracker:
         heights = [height + HALF_M for height in self._surfaces(name, pose)]
         height = min(heights, key=lambda h: abs(h - pose[2, 3]))
         if abs(height - pose[2, 3]) > slack:
-            return fit
+            # Nothing floats: sooner than that, a corner is covered.
+            return fit if fit.error_px <= _FLYING_PX else None
         priors = Priors(_TILT_STD, height, _HEIGHT_STD_M)
         standing = fit_pose(self._view, item, rays, pose, priors)
         stands = standing is not None and standing.error_px < max(_UPRIGHT_PX, 1.5 * fit.error_px)
