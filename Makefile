@@ -12,7 +12,7 @@ ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 DEMO := runs/demo
 DEMO_TASK ?= stack
 DEMO_EPISODES ?= 1500
-DEMO_PRETRAIN ?= --updates 18000
+DEMO_PRETRAIN ?= --updates 24000
 DEMO_FINETUNE ?= --online.rounds 8 --online.evaluate-every 4
 DEMO_EVALUATION ?= --episodes 100 --seed 1000
 

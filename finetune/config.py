@@ -12,7 +12,7 @@ from pretrain.config import DeviceName, SubgoalConfig
 class OnlineConfig:
     """Online fine-tuning."""
 
-    rounds: int = 40
+    rounds: int = 100
     worlds: int = 32
     round_steps: int = 50
     """Steps of every world in a round."""
@@ -36,7 +36,7 @@ class OnlineConfig:
     """At the start; it falls with the other."""
     replay_size: int = 1_000_000
     """Rows kept of the worlds' trajectories (Table I: D)."""
-    evaluate_every: int = 5
+    evaluate_every: int = 10
     """Rounds between evaluations, each followed by a checkpoint."""
     evaluation_episodes: int = 100
 
