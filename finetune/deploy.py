@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from eisp_data.config import save_yaml
-from eisp_data.errors import ConfigError, EispError
+from eisp_data.errors import ConfigError, EispError, RobotError
 from eisp_data.robots.record_controllers import Controller, Decision, Limited, Script, Slowed
 from eisp_data.robots.session import Ended
 from eisp_data.robots.session_cell import Cell
@@ -64,6 +64,24 @@ class _Run:
         limited = Limited(found, self.task.paper.episode_steps)
         return Slowed(limited, self.task, self.config.ticks_per_step)
 
+    def stopped(self, fault: str) -> None:
+        """Note an episode that a fault ended: on the twin it is a failure, and --resume goes on."""
+        started = self.first + len(self.report.episodes)
+        if self.config.robot == "twin" and len(self.report.goals) > len(self.report.episodes):
+            self._note(
+                {
+                    "episode": started,
+                    "seed": self.config.seed + started,
+                    "outcome": "stopped",
+                    "fault": fault,
+                    "success": False,
+                }
+            )
+
+    def _note(self, entry: dict[str, object]) -> None:
+        with (self.config.output_dir / RESULTS).open("a") as file:
+            file.write(json.dumps(entry) + "\n")
+
     def watch(self, step: int, seen: Seen, decision: Decision) -> None:
         """Let the hand see each tick."""
         if self.hand is None:
@@ -90,8 +108,7 @@ class _Run:
         if self.hand is not None:
             entry["interfered"] = self.hand.moved
         if ended.outcome:
-            with (self.config.output_dir / RESULTS).open("a") as file:
-                file.write(json.dumps(entry) + "\n")
+            self._note(entry)
 
 
 def deploy(config: DeployConfig) -> None:
@@ -108,6 +125,9 @@ def deploy(config: DeployConfig) -> None:
         return
     try:
         run_session(config, _plan(run), run.controller, report, run.watch, run.after)
+    except RobotError as error:
+        run.stopped(str(error))
+        raise
     finally:
         for line in report.lines():
             print(line)

@@ -22,6 +22,8 @@ _MET_TICKS = 12
 """An episode is a success once its goal has been met for half a second."""
 _LOOK_TICKS = 75
 """Everything has to be seen within three seconds before an episode begins."""
+_YIELD_SHARE = 0.6
+"""Of a joint's greatest torque. In training 60 N was the most that the gripper could push with."""
 
 Watch = Callable[[int, Seen, Decision], None]
 
@@ -144,9 +146,16 @@ class Session:
         raise AssertionError("ticks never end")
 
     def _send(self, action: np.ndarray) -> JointCommand:
+        """Send an action; an arm that presses too hard against something gives way for a tick."""
         if self._fingers_closed:
             action = np.append(action[:3], -1.0)
-        command = self._robot.command(self._servo.step(action, self._sent))
+        wanted = self._servo.step(action, self._sent)
+        reading = self._log.reading
+        if reading.joint_effort is not None:
+            share = np.abs(reading.joint_effort) / self._robot.limits.effort
+            if share.max() > _YIELD_SHARE:
+                wanted = JointCommand(reading.joint_position, wanted.gripper_opening_m)
+        command = self._robot.command(wanted)
         self._sent = command.joint_position
         return command
 
