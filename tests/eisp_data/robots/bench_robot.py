@@ -28,6 +28,8 @@ class BenchRobot(Robot):
     name, arm, control_hz = "bench", "ur3", 25.0
     unplugs_after_s = float("inf")
     """Of the robots made from now on."""
+    presses = 0.0
+    """Share of the greatest torque that every joint of theirs reads."""
     made: ClassVar[list[BenchRobot]] = []
 
     def __init__(self, host: str = "", camera: str | None = None) -> None:
@@ -52,7 +54,8 @@ class BenchRobot(Robot):
 
     def observe(self) -> Reading:
         at = np.floor(self._now_s * READING_HZ + 1e-6) / READING_HZ
-        return Reading(self._joints.copy(), np.zeros(6), self._opening, float(at))
+        effort = self.presses * self.limits.effort
+        return Reading(self._joints.copy(), np.zeros(6), self._opening, float(at), effort)
 
     def frames(self) -> dict[str, CameraFrame]:
         if self._now_s > self.unplugged_after_s:

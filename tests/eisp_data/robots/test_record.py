@@ -184,6 +184,21 @@ def test_an_error_of_our_own_leaves_a_standing_robot_and_a_closed_log(
         assert log.indexed and not log.problems
 
 
+@pytest.mark.parametrize(("presses", "moves"), [(0.3, True), (0.8, False)])
+def test_an_arm_that_presses_too_hard_gives_way(
+    tmp_path: Path,
+    bench: type[BenchRobot],
+    monkeypatch: pytest.MonkeyPatch,
+    presses: float,
+    moves: bool,
+) -> None:
+    hand_on(monkeypatch, HandOnGamepad(reads=10))
+    monkeypatch.setattr(BenchRobot, "presses", presses)
+    record(recorded(tmp_path))
+    sent = np.array([command.joint_position for command in bench.made[0].sent])
+    assert (np.ptp(sent, axis=0).max() > 0.01) == moves
+
+
 def test_a_dry_run_commands_nothing(
     tmp_path: Path, bench: type[BenchRobot], monkeypatch: pytest.MonkeyPatch
 ) -> None:
