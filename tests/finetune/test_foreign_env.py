@@ -13,6 +13,7 @@ from eisp_data.sim.gym_worlds import GymWorlds
 from finetune.config import EnvConfig, FinetuneConfig, OnlineConfig
 from finetune.evaluate import evaluate
 from finetune.run import load_for_rollouts
+from pretrain import checkpoint
 from pretrain.saved import saved_subgoals
 
 SMALL = OnlineConfig(
@@ -57,10 +58,20 @@ def test_an_environment_is_learned_from_nothing(tmp_path, env_id):
 
 
 @pytest.mark.parametrize("env_id", ["line_env:PushedLine-v0", "line_env:ShortPushedLine-v0"])
-def test_a_run_in_a_foreign_environment_resumes_as_well(tmp_path, env_id):
+def test_a_run_in_a_foreign_environment_resumes_as_well(tmp_path, env_id, monkeypatch):
     longer = replace(SMALL, rounds=2)
     learn(env_id, tmp_path / "whole", online=longer)
-    learn(env_id, tmp_path / "parts")
+    save = checkpoint.save
+
+    def save_and_stop(run: Path, at: int, *args: object) -> None:
+        save(run, at, *args)  # type: ignore[arg-type]
+        if at == 1:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "save", save_and_stop)
+        with pytest.raises(KeyboardInterrupt):
+            learn(env_id, tmp_path / "parts", online=longer)
     learn(env_id, tmp_path / "parts", online=longer, resume=True)
     assert metrics_of(tmp_path / "parts") == metrics_of(tmp_path / "whole")
 

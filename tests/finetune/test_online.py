@@ -205,7 +205,7 @@ def test_a_dataset_of_another_task_is_refused(pretrained, tmp_path):
     root = tmp_path / "push4"
     collect(CollectConfig(root, task="push4", policy="random", episodes=1, workers=1))
     config = tiny_finetuning(pretrained, tmp_path / "run")
-    with pytest.raises(DataError, match="is a dataset of 'push4', the policy one of 'stack'"):
+    with pytest.raises(DataError, match="is a dataset of 'push4', not of 'stack'"):
         finetune(replace(config, dataset=DataConfig(root)))
     assert not (tmp_path / "run").exists()
 
