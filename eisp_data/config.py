@@ -61,6 +61,13 @@ def load_yaml[T](kind: type[T], path: Path, absent: Any = None) -> T:
         raise ConfigError(f"{path}: {error}") from None
 
 
+def at_least(least: int, options: Mapping[str, int | None]) -> None:
+    """Raise ConfigError, naming the option, unless each that is given is at least this."""
+    for flag, value in options.items():
+        if value is not None and value < least:
+            raise ConfigError(f"{flag} must be at least {least}; got {value}")
+
+
 def _build(kind: Any, plain: Any, where: str, absent: Any) -> Any:
     """Return ``plain`` as a value of the type ``kind``; ``where`` ends in a dot if anything."""
     if kind is Any or (absent is not None and plain is absent):

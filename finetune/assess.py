@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from eisp_data.config import at_least
 from eisp_data.errors import ConfigError
 from eisp_data.tasks.images import state_task
 from eisp_data.tasks.registry import TASKS
@@ -10,7 +11,7 @@ from finetune.evaluate import Evaluation, evaluate
 from finetune.oracle import oracle_return
 from finetune.run import load_for_rollouts, make_worlds
 from finetune.video import Film
-from pretrain.checks import at_least, check_subgoals
+from pretrain.checks import check_subgoals
 from pretrain.device import set_up
 
 _ORACLE_EPISODES = 100

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from eisp_data.config import save_yaml
+from eisp_data.config import at_least, save_yaml
 from eisp_data.errors import ConfigError, EispError, RobotError
 from eisp_data.robots.record_controllers import Controller, Decision, Limited, Script, Slowed
 from eisp_data.robots.session import Ended
@@ -24,7 +24,7 @@ from finetune.disturb import Hand
 from finetune.evaluate import share_interval
 from finetune.run import load_for_rollouts
 from pretrain.agent import Agent
-from pretrain.checks import at_least, check_subgoals
+from pretrain.checks import check_subgoals
 from pretrain.config import SubgoalConfig
 from pretrain.device import set_up
 from pretrain.saved import saved_subgoals

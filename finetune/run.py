@@ -11,7 +11,7 @@ import torch
 
 from eisp_data.cli.collect import episode_seeds
 from eisp_data.collect import explore
-from eisp_data.config import load_yaml
+from eisp_data.config import at_least, load_yaml
 from eisp_data.errors import ConfigError
 from eisp_data.runs.folder import begin_run, has_progress
 from eisp_data.sim.gym_worlds import AnyWorlds, GymWorlds
@@ -21,7 +21,7 @@ from eisp_data.tasks.registry import TASKS
 from finetune.config import FinetuneConfig
 from finetune.train import Finetuner
 from pretrain.agent import BANK, Agent
-from pretrain.checks import at_least, check_subgoals
+from pretrain.checks import check_subgoals
 from pretrain.config import PretrainConfig, SubgoalConfig
 from pretrain.device import describe, set_up
 from pretrain.layout import Layout

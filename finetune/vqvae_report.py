@@ -17,6 +17,7 @@ import torch
 from PIL import Image
 
 from eisp_data.errors import ConfigError, DataError
+from eisp_data.runs.episodes import rows_of, split
 from eisp_data.storage.cache import load_arrays, load_images
 from eisp_data.storage.files import replace_atomically
 from finetune.charts import Series, line_chart
@@ -27,7 +28,7 @@ from pretrain.saved import saved_subgoals
 from vqvae.evaluate import evaluate, training_of
 from vqvae.model import VqVae
 from vqvae.saved import load
-from vqvae.train import rows_of, split, spread
+from vqvae.train import spread
 from vqvae.worlds import ImageWorlds
 
 _PICTURES = 12

@@ -2,19 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
+from eisp_data.config import at_least
 from eisp_data.errors import ConfigError
 from pretrain.config import GoalMix, PretrainConfig, SubgoalConfig
 
 _ROUNDING = 1e-6
-
-
-def at_least(least: int, options: Mapping[str, int | None]) -> None:
-    """Raise ConfigError, naming the option, unless each that is given is at least this."""
-    for flag, value in options.items():
-        if value is not None and value < least:
-            raise ConfigError(f"{flag} must be at least {least}; got {value}")
 
 
 def check_pretrain(config: PretrainConfig) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import cast, get_args
 
 from eisp_data.cli.run import fail, run
-from eisp_data.cli.words import given, saved_run, take
+from eisp_data.cli.words import given, preset_name, saved_run, take
 from eisp_data.errors import ConfigError, EispError
 from eisp_data.storage.reader import read_spec
 from eisp_data.tasks.images import image_task
@@ -40,9 +40,7 @@ def _start(words: list[str]) -> tuple[list[str], PretrainConfig | None]:
     saved = saved_run(words, PretrainConfig, "pretrain.yaml")
     if saved or given(words, "--config"):
         return words, saved
-    name = name or "cpu"
-    if name not in get_args(PresetName):
-        raise ConfigError(f"--preset {name}: choose one of {', '.join(get_args(PresetName))}")
+    known = cast(PresetName, preset_name(name, get_args(PresetName)))
     _, root = take(words, "--dataset.root")
     if root is None and not (given(words, "--help") or given(words, "-h")):
         raise ConfigError("missing --dataset.root, the folder of a dataset (see eisp-collect)")
@@ -50,8 +48,7 @@ def _start(words: list[str]) -> tuple[list[str], PretrainConfig | None]:
     if root and vqvae:
         vision = load_config(Path(vqvae))
         folder = Path("runs") / f"{image_task(vision.task)}_pretrain"
-        known = cast(PresetName, name)
         return words, image_preset(known, vision, Path(vqvae), Path(root), folder)
     task = read_spec(Path(root)).task if root else "stack"
     folder = Path("runs") / f"{task}_pretrain"
-    return words, preset(cast(PresetName, name), task, Path(root or "data/stack"), folder)
+    return words, preset(known, task, Path(root or "data/stack"), folder)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from eisp_data.errors import ConfigError
+from eisp_data.runs.device import choose_device
 from eisp_data.sim.physics import default_threads
 from pretrain.config import DeviceName
 
@@ -19,9 +19,7 @@ def set_up(device: DeviceName, threads: int) -> str:
         threads: cores of the processor, shared by the two halves of an update (see
             ``pretrain.learner``).
     """
-    if device == "cuda" and not torch.cuda.is_available():
-        raise ConfigError("--device cuda: this torch sees no CUDA device; choose auto or cpu")
-    chosen = "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
+    chosen = choose_device(device)
     torch.set_num_threads(max(1, threads // 2))
     torch.set_float32_matmul_precision("medium")
     return chosen

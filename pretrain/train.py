@@ -11,6 +11,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from eisp_data.errors import DataError
+from eisp_data.runs.episodes import rows_of, split
 from eisp_data.runs.folder import begin_run, has_progress
 from eisp_data.runs.metrics import MetricsLog
 from eisp_data.storage.cache import DatasetArrays
@@ -120,13 +121,12 @@ def load_trajectories(
     """Read the dataset into memory, split by episode into what is learned from and held out."""
     arrays = load_seen(config.dataset.root, config.agent, vision)
     layout = layout_of(arrays)
-    order = np.random.default_rng(config.seed).permutation(arrays.num_episodes)
-    held = max(1, round(config.validation_share * arrays.num_episodes))
-    if held >= arrays.num_episodes:
+    held, rest = split(arrays.num_episodes, config.validation_share, config.seed)
+    if not len(rest):
         raise DataError(f"{config.dataset.root} has too few episodes: {arrays.num_episodes}")
     parts = config.agent.waypoints
-    held_out = gather(arrays, np.sort(order[:held]), layout, parts)
-    train = gather(arrays, np.sort(order[held:]), layout, parts)
+    held_out = gather(arrays, held, layout, parts)
+    train = gather(arrays, rest, layout, parts)
     for name, data in (("training", train), ("held-out", held_out)):
         if not len(data.leading):
             raise DataError(f"{config.dataset.root}: nothing ever moves in its {name} episodes")
@@ -149,14 +149,13 @@ def gather(
     arrays: DatasetArrays, episodes: np.ndarray, layout: Layout, parts: int | None
 ) -> Trajectories:
     """Copy the named episodes into memory."""
-    starts, stops = arrays.episode_start[episodes], arrays.episode_start[episodes + 1]
-    rows = np.concatenate([np.arange(a, b) for a, b in zip(starts, stops, strict=True)])
+    rows, lengths = rows_of(arrays, episodes), np.diff(arrays.episode_start)[episodes]
     data = Trajectories(layout, len(rows), parts, purposeful=True)
     data.extend(
         arrays.observation[rows],
         arrays.achieved_goal[rows],
         arrays.action[rows],
-        np.repeat(arrays.desired_goal[episodes], stops - starts, axis=0),
-        np.concatenate([[0], np.cumsum(stops - starts)]),
+        np.repeat(arrays.desired_goal[episodes], lengths, axis=0),
+        np.concatenate([[0], np.cumsum(lengths)]),
     )
     return data

@@ -11,7 +11,7 @@ from typing import cast, get_args
 import tyro
 
 from eisp_data.cli.run import USER_ERROR, fail, run
-from eisp_data.cli.words import given, saved_run, take
+from eisp_data.cli.words import given, preset_name, saved_run, take
 from eisp_data.errors import ConfigError, EispError
 from vqvae.config import VqVaeTrainConfig
 from vqvae.presets import PresetName, preset
@@ -85,14 +85,12 @@ def _start(words: list[str]) -> tuple[list[str], VqVaeTrainConfig | None]:
     resumed = saved_run(words, VqVaeTrainConfig, "vqvae.yaml")
     if resumed or given(words, "--config"):
         return words, resumed
-    name = name or "cpu"
-    if name not in get_args(PresetName):
-        raise ConfigError(f"--preset {name}: choose one of {', '.join(get_args(PresetName))}")
+    known = cast(PresetName, preset_name(name, get_args(PresetName)))
     _, root = take(words, "--dataset.root")
     if root is None and not (given(words, "--help") or given(words, "-h")):
         raise ConfigError("missing --dataset.root, a dataset with images (see eisp-data render)")
     folder = Path("runs/vqvae")
-    return words, preset(cast(PresetName, name), Path(root or "data/images"), folder)
+    return words, preset(known, Path(root or "data/images"), folder)
 
 
 if __name__ == "__main__":

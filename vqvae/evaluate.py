@@ -9,6 +9,7 @@ import numpy as np
 
 from eisp_data.config import load_yaml
 from eisp_data.errors import ConfigError
+from eisp_data.runs.episodes import rows_of, split
 from eisp_data.sim.pixels import Pixels
 from eisp_data.storage.cache import load_arrays, load_images
 from eisp_data.tasks.registry import get_task
@@ -19,7 +20,7 @@ from vqvae.model import VqVae
 from vqvae.probe import Probe, probe
 from vqvae.quality import Quality, measure
 from vqvae.saved import load
-from vqvae.train import CONFIG_FILE, rows_of, split, spread
+from vqvae.train import CONFIG_FILE, spread
 
 _DRAWN = 1000
 _MOST = 5_000

@@ -12,8 +12,11 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from eisp_data.config import at_least
 from eisp_data.errors import ConfigError, DataError
 from eisp_data.runs import MODEL, checkpoint
+from eisp_data.runs.device import choose_device
+from eisp_data.runs.episodes import rows_of, split
 from eisp_data.runs.folder import begin_run, has_progress
 from eisp_data.runs.metrics import MetricsLog
 from eisp_data.storage.cache import DatasetArrays, load_arrays, load_images
@@ -35,7 +38,8 @@ def train(config: VqVaeTrainConfig) -> tuple[Path, Quality]:
     run = config.output_dir
     check(config)
     resumed = has_progress(run, config.resume, CONFIG_FILE)
-    device = _set_up(config)
+    device = choose_device(config.device)
+    torch.set_num_threads(config.threads)
     images, arrays, episodes, held_episodes = load_frames(config)
     train_rows, held_rows = rows_of(arrays, episodes), rows_of(arrays, held_episodes)
     torch.manual_seed(config.seed)
@@ -109,20 +113,19 @@ def learning_rate(config: VqVaeTrainConfig, update: int) -> float:
 def check(config: VqVaeTrainConfig) -> None:
     """Raise ConfigError, naming the option, unless the settings can be used."""
     model = config.model
-    least = {
-        "--updates": config.updates,
-        "--batch-size": config.batch_size,
-        "--validate-every": config.validate_every,
-        "--threads": config.threads,
-        "--model.latent-channels": model.latent_channels,
-        "--model.codes": model.codes,
-        "--model.revive-after": model.revive_after,
-    }
-    for flag, value in least.items():
-        if value < 1:
-            raise ConfigError(f"{flag} must be at least 1; got {value}")
-    if config.seed < 0:
-        raise ConfigError(f"--seed must be at least 0; got {config.seed}")
+    at_least(
+        1,
+        {
+            "--updates": config.updates,
+            "--batch-size": config.batch_size,
+            "--validate-every": config.validate_every,
+            "--threads": config.threads,
+            "--model.latent-channels": model.latent_channels,
+            "--model.codes": model.codes,
+            "--model.revive-after": model.revive_after,
+        },
+    )
+    at_least(0, {"--seed": config.seed})
     for flag, share in (
         ("--validation-share", config.validation_share),
         ("--model.decay", model.decay),
@@ -152,19 +155,6 @@ def load_frames(
     return images, arrays, rest, held
 
 
-def rows_of(arrays: DatasetArrays, episodes: np.ndarray) -> np.ndarray:
-    """Return the rows of the named episodes."""
-    starts, stops = arrays.episode_start[episodes], arrays.episode_start[episodes + 1]
-    return np.concatenate([np.arange(a, b) for a, b in zip(starts, stops, strict=True)])
-
-
-def split(episodes: int, share: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the numbers of the episodes that are held out, and of the others, each in order."""
-    order = np.random.default_rng(seed).permutation(episodes)
-    held = max(1, round(share * episodes))
-    return np.sort(order[:held]), np.sort(order[held:])
-
-
 def spread(rows: np.ndarray, count: int) -> np.ndarray:
     """Return at most ``count`` of the rows, evenly spread."""
     return rows[np.unique(np.linspace(0, len(rows) - 1, min(count, len(rows))).astype(np.int64))]
@@ -174,10 +164,3 @@ def moments(images: np.ndarray) -> tuple[Tensor, Tensor]:
     """Return mean and deviation (3,) of the pixels of (N, H, W, 3) uint8 images, in 0..1."""
     pixels = images.reshape(-1, 3).astype(np.float32) / 255.0
     return torch.from_numpy(pixels.mean(0)), torch.from_numpy(pixels.std(0))
-
-
-def _set_up(config: VqVaeTrainConfig) -> str:
-    if config.device == "cuda" and not torch.cuda.is_available():
-        raise ConfigError("--device cuda: this torch sees no CUDA device; choose auto or cpu")
-    torch.set_num_threads(config.threads)
-    return "cuda" if config.device != "cpu" and torch.cuda.is_available() else "cpu"

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from eisp_data.cli.run import run
+from eisp_data.config import at_least
 from eisp_data.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -45,8 +46,7 @@ def calibrate(config: CalibrateConfig) -> None:
 
     Nothing but its four markers may be on the table. docs/perception.md says what to print.
     """
-    if config.views < 1:
-        raise ConfigError(f"--views must be at least 1; got {config.views}")
+    at_least(1, {"--views": config.views})
     if not config.output.resolve().parent.is_dir():
         raise ConfigError(f"--output: there is no folder {config.output.resolve().parent}")
     from tqdm import tqdm

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from eisp_data.cli.run import run
+from eisp_data.config import at_least
 from eisp_data.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -108,9 +109,7 @@ def _check(config: CollectConfig) -> None:
         raise ConfigError(f"--episodes must be 1 to {_SEEDS_APART}; got {config.episodes}")
     if not 0 <= config.seed <= _LAST_SEED:
         raise ConfigError(f"--seed must be 0 to {_LAST_SEED}; got {config.seed}")
-    for flag, value in (("--workers", config.workers), ("--worlds", config.worlds)):
-        if value is not None and value < 1:
-            raise ConfigError(f"{flag} must be at least 1; got {value}")
+    at_least(1, {"--workers": config.workers, "--worlds": config.worlds})
     if config.resume and not (config.output_dir / "meta/info.json").exists():
         raise ConfigError(f"--resume: {config.output_dir} holds no dataset")
     if not config.resume and (config.output_dir / "meta/info.json").exists():

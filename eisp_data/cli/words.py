@@ -26,6 +26,18 @@ def given(words: Sequence[str], flag: str) -> bool:
     return any(word.partition("=")[0] == flag for word in words)
 
 
+def preset_name(value: str | None, choices: Sequence[str]) -> str:
+    """Return which preset ``--preset`` names, ``cpu`` if it was left out.
+
+    Raises:
+        ConfigError: there is none of that name.
+    """
+    name = value or "cpu"
+    if name not in choices:
+        raise ConfigError(f"--preset {name}: choose one of {', '.join(choices)}")
+    return name
+
+
 def saved_run[T](words: Sequence[str], kind: type[T], name: str) -> T | None:
     """Return the configuration that ``--resume`` goes on with, from the ``--output-dir``.
 

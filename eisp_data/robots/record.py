@@ -7,6 +7,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from eisp_data.config import at_least
 from eisp_data.errors import ConfigError
 from eisp_data.robots.session_cell import Cell, CellConfig
 
@@ -68,13 +69,7 @@ def record(config: RecordConfig) -> Report:
 
 def check(config: RecordConfig) -> None:
     """Raise ConfigError for settings that cannot be used, before anything is connected."""
-    at_least_one = {
-        "--episodes": config.episodes,
-        "--ticks-per-step": config.ticks_per_step,
-    }
-    for flag, count in at_least_one.items():
-        if count < 1:
-            raise ConfigError(f"{flag} must be at least 1; got {count}")
+    at_least(1, {"--episodes": config.episodes, "--ticks-per-step": config.ticks_per_step})
     if not 0 < config.episode_s < float("inf"):
         raise ConfigError(f"--episode-s must be above 0; got {config.episode_s}")
     if not 0 < config.teleop_speed <= 1:
