@@ -87,7 +87,7 @@ class SubgoalConfig:
 
 @dataclass(frozen=True)
 class GoalMix:
-    """Which goals the low-level policy learns from."""
+    """Which goals the low-level policy and the generator learn from."""
 
     waypoint: float = 0.5
     """Share of goals that are the next waypoint: what a subgoal generator will ask for."""
@@ -97,6 +97,9 @@ class GoalMix:
     """Share of goals that send one object to where it lay at another time."""
     pursued: float = 0.0
     """Share of goals that are those that the trajectory was after, whether it met them or not."""
+    complete: float = 0.25
+    """Share of the generator's samples that lead to the very goal of a demonstration: only few
+    show the whole task, and what comes first in it."""
     horizon: int = 40
     """How many steps later a ``future`` goal may lie."""
     tolerance_m: float = 0.05

@@ -143,6 +143,10 @@ class Waypoints:
         last = np.where(rng.random(len(rows)) < 0.5, furthest, any_of_them)
         return self.row[first], self.row[last]
 
+    def furthest(self, rows: np.ndarray) -> np.ndarray:
+        """Return the dataset rows (B,) of the furthest waypoints that are no detours."""
+        return self.row[self.beyond[self.following[rows]] - 1]
+
     def joined(self, later: Waypoints) -> Waypoints:
         """Return these waypoints and those of rows that come after."""
         rows, count = len(self.following), len(self.row)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -69,14 +70,16 @@ class Learner:
         batch = batch.to(device)
         # All of the noise of actor and critics comes first: beside the generator, which draws its
         # own, nothing else may draw from the stream.
-        now, then = torch.randn(2, *batch.action.shape, device=device)
+        noise, later_noise = torch.randn(2, *batch.action.shape, device=device)
+        now, then = self._sac.see(batch)
+        critic = partial(self._critic_gradient, batch, now, then, later_noise)
         if hindsight:
             sample = [tensor.to(device) for tensor in hindsight]
             beside = self._start(lambda: self._generator_gradient(sample))
-            info = self._critic_gradient(batch, then)
+            info = critic()
         else:
-            beside, info = self._start(lambda: self._critic_gradient(batch, then)), {}
-        info |= self._actor_gradient(batch, now, cloning) | beside()
+            beside, info = self._start(critic), {}
+        info |= self._actor_gradient(batch, now, noise, cloning) | beside()
         for optimizer in (self._critic, self._actor):
             optimizer.step()
         if hindsight:
@@ -89,13 +92,13 @@ class Learner:
             return self._beside.submit(work).result
         return work
 
-    def _critic_gradient(self, batch: Batch, noise: Tensor) -> Info:
-        loss, info = self._sac.critic_loss(batch, noise)
+    def _critic_gradient(self, batch: Batch, seen: Tensor, then: Tensor, noise: Tensor) -> Info:
+        loss, info = self._sac.critic_loss(batch, seen, then, noise)
         _gradient(loss, self._critic)
         return info
 
-    def _actor_gradient(self, batch: Batch, noise: Tensor, cloning: float) -> Info:
-        loss, info = self._sac.actor_loss(batch, noise, cloning)
+    def _actor_gradient(self, batch: Batch, seen: Tensor, noise: Tensor, cloning: float) -> Info:
+        loss, info = self._sac.actor_loss(batch, seen, noise, cloning)
         _gradient(loss, self._actor)
         return info
 

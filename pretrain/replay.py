@@ -6,12 +6,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from eisp_data.tasks.base import SUCCESS_DISTANCE_M
 from pretrain.config import GoalMix
 from pretrain.hindsight import Waypoints, find_waypoints
 from pretrain.layout import Layout
 from pretrain.sac import Batch
 
 _MOVED_M = 0.01
+_LEAST_STD = 1e-3
+"""A dimension that varies by less, a millimetre where it is a length, says nothing."""
 
 
 class Trajectories:
@@ -76,10 +79,17 @@ class Trajectories:
         self.leading = self.acting[self.waypoints.following[self.acting] >= 0]
         """Rows that have a waypoint after them."""
         self._guiding = self.acting if self._purposeful else self.leading
+        self._complete = self._meeting_their_own_goal() if self._purposeful else self.leading[:0]
         self._next_rest = self._last.copy()
         ahead = self.waypoints.following >= 0
         self._next_rest[ahead] = self.waypoints.row[self.waypoints.following[ahead]]
         """For each row the next waypoint, or where there is none the end of the episode."""
+
+    def _meeting_their_own_goal(self) -> np.ndarray:
+        """Return the rows of ``leading`` after which the goal that was pursued is met at rest."""
+        ends = self.waypoints.furthest(self.leading)
+        missed = np.linalg.norm(self.achieved_goal[ends] - self.pursued[self.leading], axis=1)
+        return self.leading[missed <= SUCCESS_DISTANCE_M]
 
     def transitions(self, count: int, mix: GoalMix, rng: np.random.Generator) -> Batch:
         """Draw transitions with goals relabelled as the mix says."""
@@ -132,12 +142,12 @@ class Trajectories:
     def moments(self) -> dict[str, Tensor]:
         """Return means and standard deviations of observations and goals.
 
-        A dimension that never varies gets deviation one, so that it standardises to zero.
+        A dimension that hardly varies gets deviation one, so that it standardises to almost zero.
         """
         result = {}
         for name, array in (("observation", self.observation), ("goal", self.achieved_goal)):
             mean, std = array.mean(0, dtype=np.float64), array.std(0, dtype=np.float64)
-            std[std < 1e-6] = 1.0
+            std[std < _LEAST_STD] = 1.0
             result[f"{name}_mean"] = torch.from_numpy(mean.astype(np.float32))
             result[f"{name}_std"] = torch.from_numpy(std.astype(np.float32))
         return result
@@ -159,8 +169,11 @@ class Trajectories:
         Returns:
             Observations (count, S), final goals (count, G) and the next waypoints (count, G).
         """
+        whole = round(mix.complete * count) if len(self._complete) else 0
         rows = self.leading[rng.integers(len(self.leading), size=count)]
+        rows[:whole] = self._complete[rng.integers(len(self._complete), size=whole)]
         subgoal, goal = self.waypoints.subgoal_and_goal(rows, rng)
+        goal[:whole] = self.waypoints.furthest(rows[:whole])
         final = self.achieved_goal[goal]
         return (
             torch.from_numpy(self.observation[rows]),

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from pretrain.config import SacConfig
-from pretrain.networks import EnsembleMLP, mlp
+from pretrain.networks import MLP, EnsembleMLP
 
 Info = dict[str, Tensor]
 
@@ -55,7 +55,7 @@ class Actor(nn.Module):
 
     def __init__(self, size: int, layers: Sequence[int], actions: int) -> None:
         super().__init__()
-        self.body = mlp(size, layers, 2 * actions)
+        self.body = MLP(size, layers, 2 * actions)
 
     def forward(self, seen: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and log standard deviation, each (B, A), before the tanh."""
@@ -128,26 +128,37 @@ class Sac(nn.Module):
         action, log_prob, _ = self.actor.sample(seen)
         return self.critic(seen, action).amin(0) - self.config.alpha * log_prob
 
-    def critic_loss(self, batch: Batch, noise: Tensor) -> tuple[Tensor, Info]:
+    def see(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """Return the features (B, F) of the transitions' observations and of those that follow."""
+        both = torch.cat([batch.observation, batch.next_observation])
+        now, then = self.features(both, batch.goal.repeat(2, 1)).chunk(2)
+        return now, then
+
+    def critic_loss(
+        self, batch: Batch, seen: Tensor, then: Tensor, noise: Tensor
+    ) -> tuple[Tensor, Info]:
         """Return the mean squared Bellman error of both critics.
 
         Args:
             batch: of transitions.
+            seen: (B, F) their features before.
+            then: (B, F) their features after.
             noise: (B, A) standard normal, for the actions that follow.
         """
         with torch.no_grad():
-            then = self.features(batch.next_observation, batch.goal)
             action, log_prob, _ = self.actor.sample(then, noise)
             following = self.target(then, action).amin(0)
             following = following - self.config.alpha * log_prob
             target = batch.reward + self.config.gamma * following
             if self.config.clip_targets:
                 target = target.clamp(self.lowest_value, 0.0)
-        value = self.critic(self.features(batch.observation, batch.goal), batch.action)
+        value = self.critic(seen, batch.action)
         loss = (value - target).square().mean()
         return loss, {"critic_loss": loss.detach(), "value": value.detach().mean()}
 
-    def actor_loss(self, batch: Batch, noise: Tensor, cloning: float) -> tuple[Tensor, Info]:
+    def actor_loss(
+        self, batch: Batch, seen: Tensor, noise: Tensor, cloning: float
+    ) -> tuple[Tensor, Info]:
         """Return E [alpha log pi - min Q] plus the cloning term.
 
         Demonstrated actions are cloned as they are, the policy's own only where they are worth
@@ -155,10 +166,10 @@ class Sac(nn.Module):
 
         Args:
             batch: of transitions.
+            seen: (B, F) their features before.
             noise: (B, A) standard normal, for the sampled actions.
             cloning: weight of the cloning term.
         """
-        seen = self.features(batch.observation, batch.goal)
         action, log_prob, mean = self.actor.sample(seen, noise)
         value = self.critic(seen, action).amin(0)
         loss = (self.config.alpha * log_prob - value).mean()

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from pretrain.config import HybridConfig
 from pretrain.layout import Layout
-from pretrain.networks import mlp
+from pretrain.networks import MLP
 from pretrain.proposers import laplace
 from pretrain.proposers.proposer import Info, SubgoalProposer
 
@@ -44,10 +44,10 @@ class Hybrid(SubgoalProposer):
             self.register_buffer(name, value.clone())
         inputs = layout.observation_dim + layout.goal_dim
         *body, last = config.layers
-        self.encoder = nn.Sequential(mlp(inputs, body, last), nn.ReLU())
+        self.encoder = nn.Sequential(MLP(inputs, body, last), nn.ReLU())
         self.mean = nn.Linear(last, layout.goal_dim)
         self.scale = nn.Linear(last, layout.goal_dim)
-        self.decoder = mlp(inputs, config.layers, layout.goal_dim)
+        self.decoder = MLP(inputs, config.layers, layout.goal_dim)
 
     def _state(self, observation: Tensor) -> Tensor:
         return (observation - self.observation_mean) / self.observation_std

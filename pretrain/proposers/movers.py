@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from pretrain.config import MoversConfig
 from pretrain.features import object_tokens, scaled_robot
 from pretrain.layout import Layout
-from pretrain.networks import mlp
+from pretrain.networks import MLP
 from pretrain.proposers import laplace
 from pretrain.proposers.proposer import Info, SubgoalProposer
 
@@ -52,10 +52,10 @@ class Movers(SubgoalProposer):
         pair = layout.robot_dim + 2 * token + _RELATION_DIM + 1
         # Two bodies: densities of places are worth many nats, the choice of an object less than
         # one, and would be drowned out in a shared one.
-        self.choice = mlp(pair, (width,), width)
-        self.weight = mlp(layout.robot_dim + token + 2 * width, (width,), 1)
-        self.moves = mlp(pair, (width, width), 7)
-        self.decoder = mlp(layout.observation_dim + layout.goal_dim, (width,) * 2, layout.goal_dim)
+        self.choice = MLP(pair, (width,), width)
+        self.weight = MLP(layout.robot_dim + token + 2 * width, (width,), 1)
+        self.moves = MLP(pair, (width, width), 7)
+        self.decoder = MLP(layout.observation_dim + layout.goal_dim, (width,) * 2, layout.goal_dim)
         self.register_buffer("_same", torch.eye(count))
 
     def components(self, observation: Tensor, goal: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -80,7 +80,7 @@ def test_actor_and_critics_step_from_the_same_parameters(agent):
     batch, _ = sample()
     noise = torch.Generator().manual_seed(7)
     now, _ = torch.randn(2, *batch.action.shape, generator=noise)
-    loss, _ = agent.sac.actor_loss(batch, now, 1.0)
+    loss, _ = agent.sac.actor_loss(batch, agent.sac.see(batch)[0], now, 1.0)
     weights = list(agent.sac.actor.parameters())
     expected = [gradient.clone() for gradient in torch.autograd.grad(loss, weights)]
     torch.manual_seed(7)
@@ -107,7 +107,8 @@ def test_a_gpu_learns_what_a_processor_learns():
         optimizer = torch.optim.Adam(agent.sac.critic.parameters(), lr=1e-2)
         for _ in range(5):
             optimizer.zero_grad()
-            agent.sac.critic_loss(batch.to(torch.device(device)), noise.to(device))[0].backward()
+            there = batch.to(torch.device(device))
+            agent.sac.critic_loss(there, *agent.sac.see(there), noise.to(device))[0].backward()
             optimizer.step()
         weights.append(agent.sac.critic.body.weights[0].detach().cpu())
     torch.testing.assert_close(*weights, atol=1e-4, rtol=1e-4)

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from pretrain.networks import EnsembleMLP, mlp
+from pretrain.networks import MLP, EnsembleMLP, hidden_dtype
 
 
 @pytest.mark.parametrize("layer_norm", [False, True])
@@ -36,6 +36,33 @@ def test_the_members_of_an_ensemble_learn_apart():
 
 
 def test_a_perceptron_without_hidden_layers_is_linear():
-    assert [type(module) for module in mlp(3, (), 2)] == [nn.Linear]
+    assert [type(module) for module in MLP(3, (), 2)] == [nn.Linear]
     kinds = [nn.Linear, nn.ReLU, nn.Linear, nn.ReLU, nn.Linear]
-    assert [type(module) for module in mlp(3, (5, 4), 2)] == kinds
+    assert [type(module) for module in MLP(3, (5, 4), 2)] == kinds
+
+
+@pytest.fixture
+def bf16_allowed():
+    torch.set_float32_matmul_precision("medium")
+    if hidden_dtype(torch.zeros(1)) != torch.bfloat16:
+        pytest.skip("this processor has no bf16 products")
+
+
+@pytest.mark.parametrize(
+    "network", [MLP(40, (64, 64), 3), EnsembleMLP(2, 40, (64, 64), layer_norm=True)]
+)
+@pytest.mark.usefixtures("bf16_allowed")
+def test_bf16_hidden_layers_give_nearly_what_fp32_gives_and_fp32_gradients(network):
+    torch.manual_seed(0)
+    inputs = torch.randn(500, 40)
+    found = []
+    for precision in ("medium", "highest"):
+        torch.set_float32_matmul_precision(precision)
+        network.zero_grad()
+        output = network(inputs)
+        output.square().mean().backward()
+        assert output.dtype == torch.float32
+        found.append((output.detach(), next(network.parameters()).grad))
+    for rough, exact in zip(*found, strict=True):
+        assert rough.dtype == torch.float32
+        assert 0 < (rough - exact).norm() < 0.06 * exact.norm()

@@ -195,6 +195,28 @@ def test_subgoals_are_the_next_waypoint_and_goals_one_at_or_after_it():
             assert same(allowed, wanted).all(1).any()
 
 
+@pytest.mark.parametrize(("purposeful", "share"), [(True, 0.25), (True, 0.0), (False, 0.25)])
+def test_a_share_of_subgoals_leads_to_the_very_goal_of_a_demonstration(purposeful, share):
+    data = Trajectories(LAYOUT, 10**6, None, purposeful=purposeful)
+    paths = [path_of(OBJECTS, each) + np.float32(2.0 * i) for i, each in enumerate(EPISODES)]
+    starts = np.cumsum([0, *map(len, paths)])
+    rows = np.arange(starts[-1], dtype=np.float32)
+    pursued = np.repeat(100 + rows[:, None], LAYOUT.goal_dim, axis=1)
+    # The second episode alone ends, at rest, two centimetres from its goal.
+    pursued[starts[1] : starts[2]] = paths[1][-1] + np.eye(9, dtype=np.float32)[0] * 0.02
+    observation = np.stack([rows, rows], 1)
+    data.extend(observation, np.concatenate(paths), rows[:, None], pursued, starts)
+    mix = replace(MIXED, complete=share)
+    observation, goal, _ = data.subgoals(COUNT, mix, np.random.default_rng(0))
+    rows = observation[:, 0].long().numpy()
+    second = (rows >= starts[1]) & (rows < starts[2])
+    first = second[: COUNT // 4]
+    assert first.all() == (purposeful and share > 0)
+    assert not second[COUNT // 4 :].all()
+    if first.all():
+        assert same(goal[: COUNT // 4].numpy(), paths[1][-1]).all()
+
+
 def test_pursued_goals_are_exactly_those_of_the_row_and_never_cloned():
     batch, rows, goal = draw(trajectories(), PURSUED)
     np.testing.assert_array_equal(goal, np.repeat(100.0 + rows[:, None], goal.shape[1], axis=1))
@@ -254,10 +276,9 @@ def test_moments_are_those_of_the_data_and_one_where_nothing_varies():
     moments = data.moments()
     np.testing.assert_allclose(moments["observation_mean"], data.observation.mean(0), rtol=1e-5)
     np.testing.assert_allclose(moments["observation_std"], data.observation.std(0), rtol=1e-4)
-    constant = data.achieved_goal.std(0) < 1e-6
     still = trajectories([[(0, 9)]], parts=1)
-    assert not constant.all()
+    still.achieved_goal[:, 1] += np.resize([0.0, 1e-4], len(still))
     std = still.moments()["goal_std"]
     assert (std[1:] == 1).all() and 0 < std[0] < 1
     standardised = (torch.from_numpy(still.achieved_goal) - still.moments()["goal_mean"]) / std
-    assert standardised.isfinite().all() and standardised[:, 1:].abs().amax() < 1e-5
+    assert standardised.isfinite().all() and standardised[:, 1:].abs().amax() < 1e-3

@@ -43,6 +43,14 @@ def make_batch(
     return Batch(**{**values, **changes})
 
 
+def critic_loss(sac: Sac, batch: Batch, noise: torch.Tensor):
+    return sac.critic_loss(batch, *sac.see(batch), noise)
+
+
+def actor_loss(sac: Sac, batch: Batch, noise: torch.Tensor, cloning: float):
+    return sac.actor_loss(batch, sac.see(batch)[0], noise, cloning)
+
+
 def test_the_log_probability_is_that_of_a_squashed_gaussian():
     sac = make_sac(replace(LINEAR, layers=(16,)), action=3).double()
     observation, goal = torch.randn(2, 500, 1, dtype=torch.float64).unbind(0)
@@ -90,7 +98,7 @@ def test_the_value_is_the_lesser_twin_less_the_price_of_certainty():
 def test_targets_are_clipped_to_what_the_reward_allows(future, clip, target):
     sac = make_sac(replace(LINEAR, clip_targets=clip))
     sac.target.body.biases[-1].data[:] = future
-    loss, info = sac.critic_loss(make_batch(), torch.randn(8, 1))
+    loss, info = critic_loss(sac, make_batch(), torch.randn(8, 1))
     assert sac.lowest_value == pytest.approx(-10.0)
     assert loss.item() == pytest.approx(target**2, abs=1e-4)
     assert info["value"].item() == 0.0
@@ -99,7 +107,7 @@ def test_targets_are_clipped_to_what_the_reward_allows(future, clip, target):
 def test_the_target_takes_the_lesser_of_its_twins():
     sac = make_sac()
     sac.target.body.biases[-1].data[:, 0, 0] = torch.tensor([-2.0, -6.0])
-    loss, _ = sac.critic_loss(make_batch(), torch.randn(8, 1))
+    loss, _ = critic_loss(sac, make_batch(), torch.randn(8, 1))
     assert loss.item() == pytest.approx((-1 + 0.9 * -6) ** 2, rel=1e-5)
 
 
@@ -120,10 +128,10 @@ def test_values_of_a_chain_are_found():
         )
         noise = torch.randn(len(cell), 1)
         critic.zero_grad()
-        sac.critic_loss(batch, noise)[0].backward()
+        critic_loss(sac, batch, noise)[0].backward()
         critic.step()
         actor.zero_grad()
-        sac.actor_loss(batch, noise, 0.0)[0].backward()
+        actor_loss(sac, batch, noise, 0.0)[0].backward()
         actor.step()
         sac.follow()
     steps = (cells - 2 - torch.arange(cells)).clamp(min=0)
@@ -137,7 +145,7 @@ def test_the_actor_climbs_the_critic():
     sac.critic.body.weights[-1].data[:, -1] = 1.0
     optimizer = torch.optim.Adam(sac.actor.parameters(), lr=0.05)
     for _ in range(40):
-        loss, _ = sac.actor_loss(make_batch(), torch.randn(8, 1), 0.0)
+        loss, _ = actor_loss(sac, make_batch(), torch.randn(8, 1), 0.0)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -163,7 +171,7 @@ def test_of_its_own_actions_only_better_ones_are_cloned(clone, demonstrated, act
     batch = make_batch(
         action=action, clone=torch.full((8,), clone), demonstrated=torch.full((8,), demonstrated)
     )
-    _, info = sac.actor_loss(batch, torch.randn(8, 1), 1.0)
+    _, info = actor_loss(sac, batch, torch.randn(8, 1), 1.0)
     assert info["cloning_error"].item() == pytest.approx(action**2 if cloned else 0.0, abs=1e-5)
 
 
@@ -176,8 +184,8 @@ def test_cloning_weighs_the_mean_error_of_what_is_cloned():
         demonstrated=torch.ones(4),
     )
     noise = torch.randn(4, 1)
-    plain, _ = sac.actor_loss(batch, noise, 0.0)
-    loss, info = sac.actor_loss(batch, noise, 3.0)
+    plain, _ = actor_loss(sac, batch, noise, 0.0)
+    loss, info = actor_loss(sac, batch, noise, 3.0)
     assert info["cloning_error"].item() == pytest.approx((0.25 + 1.0) / 2)
     assert (loss - plain).item() == pytest.approx(3.0 * 0.625)
 
