@@ -6,8 +6,9 @@ One update is sampling with goals relabelled in hindsight, both critics, the act
 on episodes of Stack's shapes. Ours is plain SAC as in ``--preset paper``: no layer norm, no
 cloning. It is timed with its hidden layers in bf16, as it runs where the processor multiplies that
 natively, and in fp32, as the others are. All take short turns one after the other, so that whatever
-else the machine does meets them alike; the rates are over the sums of the turns. The limit is the arithmetic of one update at
-the rate at which torch multiplies matrices of that size, fp32, on the same threads.
+else the machine does meets them alike; the rates are over the sums of the turns. The limit is the
+arithmetic of one update at the rate at which torch multiplies matrices of that size, fp32, on the
+same threads.
 """
 
 from __future__ import annotations
