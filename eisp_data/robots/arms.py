@@ -48,6 +48,8 @@ class Arm:
     tool_mass_kg: float
     effort: tuple[float, ...] = ()
     """(J,) N m where the URDF does not have the data sheet's."""
+    pedestal_half_m: float = 0.0
+    """Half the width of the square column under the base; 0 where it stands on none."""
     held: Mapping[str, float] = field(default_factory=dict)
     """Other joints of the URDF that are held away from zero, rad or m."""
 
@@ -117,6 +119,7 @@ ARMS: dict[str, Arm] = {
             task_in_base_m=tuple(cell.transform_task_to_base()[:3, 3]),
             tool_mass_kg=0.93,
             effort=(56.0, 56.0, 28.0, 12.0, 12.0, 12.0),
+            pedestal_half_m=cell.PEDESTAL_HALF_M,
         ),
         _tiago("left"),
         _tiago("right"),

@@ -12,13 +12,17 @@ from __future__ import annotations
 
 import numpy as np
 
-BASE_IN_TASK_M = (-0.06, 0.0, 0.255)
-"""The arm's ``base_link`` in the task's frame; its axes are parallel to the task's."""
+BASE_IN_TASK_M = (-0.05, 0.0, 0.255)
+"""The arm's ``base_link`` in the task's frame; its axes are parallel to the task's. A centimetre
+further back, and the far corners are out of reach."""
+
+PEDESTAL_HALF_M = 0.06
+"""Half the width of the square column under the arm; the forearm comes near to a wider one."""
 
 TOOL_LENGTH_M = 0.165
 """From the flange (the URDF's ``tool0``) to the point between the fingertips."""
 
-HOME_RAD = (-0.309, -0.857, 1.899, -2.613, -1.571, -1.879)
+HOME_RAD = (-0.318, -0.880, 1.955, -2.646, -1.571, -1.889)
 """The UR3's joints with the open fingers pointing down over the middle of the workspace."""
 
 CAMERA_IN_TASK_M = (0.84, 0.0, 0.70)

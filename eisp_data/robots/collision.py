@@ -1,7 +1,7 @@
-"""Whether an arm meets itself or the table.
+"""Whether an arm meets itself, the table or the pedestal that it stands on.
 
 The links' own collision meshes, as convex hulls; what hangs on the flange is a box. The table is
-everything below its top, and of the arm only what moves is held against it.
+everything below its top, and of the arm only what moves is held against table and pedestal.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ _GRIPPER_HALF_M = (0.03, 0.06)
 """Of the box around the gripper, across and along the way that the fingers open."""
 _FINGERS_M = 0.04
 """The box ends above the fingertips: they touch things for a living."""
+_PEDESTAL_M = 1.0
+"""Height of the pedestal: down to below any table."""
 _POSTURES = 300
 
 
@@ -51,15 +53,22 @@ class CollisionChecker:
         if transform_task_to_base is not None:
             placed = transform_task_to_base
         self._data = self._model.createData()
-        self._geometry, pairs = _geometry(arm)
-        self._geometry = self._geometry.copy()
-        self._add_table(placed, pairs)
+        geometry, moving = _geometry(arm)
+        self._geometry = geometry.copy()
+        up = placed[:3, 2]
+        table = coal.Halfspace(up, up @ placed[:3, 3] + TABLE_MARGIN_M)
+        _add_obstacle(self._geometry, "table", table, pin.SE3.Identity(), moving)
+        half = spec.pedestal_half_m
+        if half:
+            below = pin.SE3(np.eye(3), np.array([0.0, 0.0, -_PEDESTAL_M / 2]))
+            pedestal = coal.Box(2 * half, 2 * half, _PEDESTAL_M)
+            _add_obstacle(self._geometry, "pedestal", pedestal, below, moving)
         self._geometry_data = self._geometry.createData()
         for request in self._geometry_data.collisionRequests:
             request.security_margin = clearance_m
 
     def is_clear(self, joint_position: np.ndarray) -> bool:
-        """Whether the arm at (J,) rad meets neither itself nor the table."""
+        """Whether the arm at (J,) rad meets nothing, itself included."""
         return not pin.computeCollisions(
             self._model, self._data, self._geometry, self._geometry_data, joint_position, True
         )
@@ -86,18 +95,23 @@ class CollisionChecker:
             if result.isCollision()
         ]
 
-    def _add_table(self, placed: np.ndarray, pairs: list[int]) -> None:
-        up = placed[:3, 2]
-        height = up @ placed[:3, 3] + TABLE_MARGIN_M
-        table = pin.GeometryObject("table", 0, 0, pin.SE3.Identity(), coal.Halfspace(up, height))
-        number = self._geometry.addGeometryObject(table)
-        for shape in pairs:
-            self._geometry.addCollisionPair(pin.CollisionPair(shape, number))
+
+def _add_obstacle(
+    geometry: pin.GeometryModel,
+    name: str,
+    shape: coal.CollisionGeometry,
+    place: pin.SE3,
+    moving: list[int],
+) -> None:
+    """Add what stands in the base's frame, to be kept clear of by the shapes of those numbers."""
+    number = geometry.addGeometryObject(pin.GeometryObject(name, 0, 0, place, shape))
+    for other in moving:
+        geometry.addCollisionPair(pin.CollisionPair(other, number))
 
 
 @cache
 def _geometry(arm: str) -> tuple[pin.GeometryModel, list[int]]:
-    """Return the arm's shapes with the pairs that can meet, and those that the table can meet."""
+    """Return the arm's shapes with the pairs that can meet, and those that can meet obstacles."""
     spec = get_arm(arm)
     geometry = _reduced_geometry(spec)
     _add_gripper(geometry, spec)

@@ -23,7 +23,6 @@ TOOL = "tool"
 TIMESTEP_S = 0.002
 
 _SLIDES = ("gripper_x", "gripper_y", "gripper_z")
-_PEDESTAL_HALF_M = 0.075
 _FLOOR_M = -0.2
 _DARK = np.array([0.25, 0.27, 0.30])
 _UNSEEN = 4
@@ -54,7 +53,7 @@ def _mount_arm(spec: mujoco.MjSpec, task: Task) -> None:
         name="pedestal",
         type=mujoco.mjtGeom.mjGEOM_BOX,
         pos=[x, y, _FLOOR_M + half],
-        size=[_PEDESTAL_HALF_M, _PEDESTAL_HALF_M, half],
+        size=[cell.PEDESTAL_HALF_M, cell.PEDESTAL_HALF_M, half],
         rgba=[0.45, 0.47, 0.5, 1.0],
     )
     arm = arm_spec()

@@ -52,8 +52,7 @@ def test_the_jacobian_is_the_derivative_of_the_pose(kinematics):
 def test_the_fingers_point_down_anywhere_in_the_workspace_without_a_collision(kinematics):
     arm = get_arm(kinematics.arm)
     clear = CollisionChecker(kinematics.arm).is_clear
-    # The UR3 comes within a centimetre of the far corners.
-    grid = np.linspace(WORKSPACE_LOW_M, np.array(WORKSPACE_HIGH_M) - (0.01, 0, 0), 4)
+    grid = np.linspace(WORKSPACE_LOW_M, WORKSPACE_HIGH_M, 4)
     for x in grid[:, 0]:
         for y in grid[:, 1]:
             for z in grid[:, 2]:
@@ -112,6 +111,11 @@ def test_home_is_clear_and_an_arm_in_the_table_is_not(arm):
     inside = kinematics.inverse(under, kinematics.home)
     assert not checker.is_clear(inside)
     assert any("table" in pair for pair in checker.meets(inside))
+
+
+def test_a_gripper_that_reaches_back_meets_the_pedestal_and_nothing_else():
+    reaching = np.array([1.09, -0.46, 2.14, -1.76, -1.50, 2.29])
+    assert CollisionChecker("ur3").meets(reaching) == [("gripper", "pedestal")]
 
 
 def test_an_arm_folded_into_itself_collides():
