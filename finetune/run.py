@@ -25,6 +25,7 @@ from pretrain.checks import check_subgoals
 from pretrain.config import PretrainConfig, SubgoalConfig
 from pretrain.device import describe, set_up
 from pretrain.layout import Layout
+from pretrain.learner import threads_of_half
 from pretrain.presets import preset
 from pretrain.replay import Trajectories
 from pretrain.saved import find_policy
@@ -41,7 +42,7 @@ def finetune(config: FinetuneConfig) -> dict[str, float]:
     run = config.output_dir
     _check(config)
     resumed = has_progress(run, config.resume, "finetune.yaml")
-    device = set_up(config.device, config.threads)
+    device = set_up(config.device, threads_of_half(config.threads))
     print(describe(device, config.threads), flush=True)
     torch.manual_seed(config.seed)
     if config.policy.path is None:

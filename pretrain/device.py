@@ -16,11 +16,10 @@ def set_up(device: DeviceName, threads: int) -> str:
 
     Args:
         device: ``auto`` takes CUDA where there is one.
-        threads: cores of the processor, shared by the two halves of an update (see
-            ``pretrain.learner``).
+        threads: of each operation of the networks, on a processor.
     """
     chosen = choose_device(device)
-    torch.set_num_threads(max(1, threads // 2))
+    torch.set_num_threads(threads)
     torch.set_float32_matmul_precision("medium")
     return chosen
 

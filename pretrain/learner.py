@@ -115,6 +115,11 @@ def _gradient(loss: Tensor, optimizer: torch.optim.Optimizer) -> None:
     loss.backward(inputs=optimizer.param_groups[0]["params"])
 
 
+def threads_of_half(threads: int) -> int:
+    """Return how many of the cores each half of an update has for its operations."""
+    return max(1, threads // 2)
+
+
 def _second_thread() -> ThreadPoolExecutor:
     # OpenMP counts its threads for each thread that uses it.
     return ThreadPoolExecutor(1, "learner", torch.set_num_threads, (torch.get_num_threads(),))

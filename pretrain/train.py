@@ -22,7 +22,7 @@ from pretrain.checks import check_pretrain
 from pretrain.config import PretrainConfig
 from pretrain.device import describe, set_up
 from pretrain.layout import Layout
-from pretrain.learner import Learner
+from pretrain.learner import Learner, threads_of_half
 from pretrain.replay import Trajectories
 from pretrain.vision import check_resumed, load_seen, load_vision
 from vqvae.model import VqVae
@@ -36,7 +36,7 @@ def pretrain(config: PretrainConfig) -> Path:
     run = config.output_dir
     check_pretrain(config)
     resumed = has_progress(run, config.resume, "pretrain.yaml")
-    device = set_up(config.device, config.threads)
+    device = set_up(config.device, threads_of_half(config.threads))
     print(describe(device, config.threads), flush=True)
     vision = load_vision(config)
     train, held_out, layout = load_trajectories(config, vision)
