@@ -12,8 +12,8 @@ import numpy as np
 from eisp_data.errors import DataError
 from eisp_data.storage.checks import Check
 from eisp_data.storage.mcap import decode, pixels
-from eisp_data.storage.mcap.assemble import SHORTEST_GAP_NS
 from eisp_data.storage.mcap.reader import ChannelStats, Entry, McapLog
+from eisp_data.storage.mcap.resample import longest_usual_gap_ns
 from eisp_data.storage.mcap.windows import cut
 
 STUCK_MESSAGES = 50
@@ -169,7 +169,7 @@ def _gap(seen: _Seen) -> str:
     times = np.sort(np.frombuffer(seen.times))
     steps = np.diff(times)
     worst = int(np.argmax(steps))
-    if steps[worst] <= max(5 * float(np.median(steps)), SHORTEST_GAP_NS / 1e9):
+    if steps[worst] <= longest_usual_gap_ns(round(1e9 * np.median(steps))) / 1e9:
         return ""
     return f"silent for {steps[worst]:.2f} s from {times[worst] - times[0]:.2f} s on"
 

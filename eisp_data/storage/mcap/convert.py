@@ -10,9 +10,10 @@ from typing import Any
 
 from eisp_data.errors import ConfigError, DataError
 from eisp_data.storage.lerobot import DatasetSpec, DatasetWriter
-from eisp_data.storage.mcap.assemble import Assembler, Made, Rate, age_columns, extra_widths
+from eisp_data.storage.mcap.assemble import Assembler, Made, Rate
 from eisp_data.storage.mcap.build import GOAL, REACHED, STATE, WORLD
 from eisp_data.storage.mcap.collect import Clock
+from eisp_data.storage.mcap.columns import age_columns, extra_widths
 from eisp_data.storage.mcap.guess import guess_mapping
 from eisp_data.storage.mcap.mapping import Mapping, load_mapping
 from eisp_data.storage.mcap.reader import McapLog

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 NANOSECONDS = 1_000_000_000
+_SHORTEST_GAP_NS = NANOSECONDS // 5
 _EARLY = 0.25
 """Of an interval: how much less than two of them still means that a sample was lost."""
 
@@ -142,3 +143,11 @@ def stands_in(
 def usual_gap_ns(series: Series) -> int:
     """Return the median time between samples; 0 with fewer than two."""
     return int(np.median(np.diff(series.times_ns))) if len(series.times_ns) > 1 else 0
+
+
+def longest_usual_gap_ns(usual_ns: int) -> int:
+    """Return how long a source may be silent before that is a gap: five usual intervals, or more.
+
+    Five intervals of a fast source are still no gap below 0.2 s.
+    """
+    return max(5 * usual_ns, _SHORTEST_GAP_NS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from eisp_data.storage.mcap.chain import chain, edges
 from eisp_data.storage.mcap.collect import LAST_TIME_NS, Clock, Collector, Source, time_of
 from eisp_data.storage.mcap.mapping import Mapping, StreamMap
 from eisp_data.storage.mcap.reader import Entry, McapLog
+from eisp_data.storage.mcap.resample import Series
 
 STATIC = "_static"
 """What ROS appends to the topic of transforms for those that never change."""
@@ -21,11 +23,23 @@ STATIC = "_static"
 class Recording:
     """What one file holds of a mapping."""
 
+    path: Path
+    """The file."""
     sources: list[Source]
     events: list[decode.Event]
     """In the order of their times, which are set."""
     problems: list[str]
     """What could not be read, one line each."""
+
+    @property
+    def first_ns(self) -> int:
+        """Time of the first sample of any source."""
+        return min(int(source.series.times_ns[0]) for source in self.sources)
+
+    @property
+    def commands(self) -> Series:
+        """The samples of the action; its components have the same times."""
+        return next(s.series for s in self.sources if s.stream.to == "action")
 
 
 def load(log: McapLog, mapping: Mapping, clock: Clock) -> Recording:
@@ -59,7 +73,7 @@ def load(log: McapLog, mapping: Mapping, clock: Clock) -> Recording:
         sources = [_source(s, parts) for s, parts in zip(streams, collectors, strict=True)]
     except DataError as error:
         raise DataError(f"{log.path}: {error}") from None
-    return Recording(sources, events, log.problems)
+    return Recording(log.path, sources, events, log.problems)
 
 
 def _source(stream: StreamMap, parts: list[Collector]) -> Source:

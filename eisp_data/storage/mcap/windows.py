@@ -22,8 +22,6 @@ class Window:
     """Somebody marked a success during the episode."""
     interventions: list[tuple[int, int]] = field(default_factory=list)
     """(from, to) of the times at which a human held the controls."""
-    first_row_ns: int = 0
-    """Time of the first row, once that is known."""
     details: dict[str, str] = field(default_factory=dict)
     """What ``episode_start`` said: policy, operator, level."""
 

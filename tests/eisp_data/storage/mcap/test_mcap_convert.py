@@ -20,8 +20,8 @@ from mcap_samples import (
 
 from eisp_data.errors import ConfigError, DataError
 from eisp_data.storage.lerobot import read_episodes
-from eisp_data.storage.mcap import assemble, messages
 from eisp_data.storage.mcap import convert as convert_module
+from eisp_data.storage.mcap import messages, timeline
 from eisp_data.storage.mcap.convert import (
     ConvertConfig,
     convert,
@@ -201,7 +201,7 @@ def test_mistakes_are_one_line_and_leave_no_half_dataset(
         with pytest.raises((DataError, ConfigError), match=message) as caught:
             run(session_file, target, mapping=mapping)
         assert "\n" not in str(caught.value)
-    monkeypatch.setattr(assemble, "MAX_EPISODE_BYTES", 1000)
+    monkeypatch.setattr(timeline, "MAX_EPISODE_BYTES", 1000)
     with pytest.raises(DataError, match="GiB"):
         run(session_file, target)
     assert not target.exists() or not list(target.glob("[!.]*"))
