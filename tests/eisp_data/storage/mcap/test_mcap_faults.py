@@ -93,30 +93,36 @@ def work(source, target):
     config = module.ConvertConfig(inputs=(Path(source),), to=Path(target), resume=True)
     say("ready")
     module.convert(config)
+    say("done")
 """
 
 
 def test_a_conversion_killed_again_and_again_ends_in_the_same_dataset(tmp_path: Path) -> None:
     source = record_session(tmp_path / "run.mcap", episodes=12, steps=10)
-    convert(ConvertConfig(inputs=(source,), to=tmp_path / "whole"))  # imports what it needs
-    begin = time.monotonic()
-    convert(ConvertConfig(inputs=(source,), to=tmp_path / "again"))
-    takes_s = time.monotonic() - begin
+    convert(ConvertConfig(inputs=(source,), to=tmp_path / "whole"))
     whole = list(read_episodes(tmp_path / "whole", images=True))
     rng = np.random.default_rng(KILLS)
     target = tmp_path / "killed"
     left: Counter[int] = Counter()
     with Nursery(CONVERT) as nursery:
-        for kill in range(KILLS):
+        nursery.start(source, tmp_path / "again")
+        assert nursery.line() == ["ready"]
+        begin = time.monotonic()
+        assert nursery.line() == ["done"]
+        takes_s = time.monotonic() - begin
+        nursery.kill()
+        while (kills := left.total()) < KILLS:
             nursery.start(source, target)
             nursery.line()
             time.sleep(float(rng.uniform(0.0, takes_s)))
-            nursery.kill()
+            if ["done"] in nursery.kill():
+                shutil.rmtree(target)
+                continue
             episodes = list(read_episodes(target)) if (target / "data").exists() else []
             left[len(episodes)] += 1
             for a, b in zip(episodes, whole, strict=False):
                 assert np.array_equal(a.observation, b.observation) and a.info == b.info
-            if kill % 2:
+            if kills % 2:
                 convert(ConvertConfig(inputs=(source,), to=target, resume=True))
                 got = list(read_episodes(target, images=True))
                 assert len(got) == len(whole)
