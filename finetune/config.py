@@ -29,8 +29,10 @@ class OnlineConfig:
     up again. It falls linearly to a tenth."""
     cloning: float = 20.0
     """Weight of cloning the actions that led to the goal."""
-    generator_every: int = 4
-    """Updates of SAC for one of the generator; 0 leaves the generator as it is."""
+    generator_every: int | None = None
+    """Updates of SAC for one of the generator; 0 leaves it as it is. Left out, it is 4 where
+    learning starts from nothing and 0 after pretraining: the pieces of a rollout are too short to
+    show what a far goal needs first."""
     generator_batch_size: int = 256
     generator_lr: float = 3e-4
     """At the start; it falls with the other."""

@@ -35,6 +35,8 @@ from vqvae.worlds import ImageWorlds
 
 _FIRST_EPISODES = 100
 """Episodes of random actions before learning from nothing."""
+_GENERATOR_EVERY = 4
+"""Updates of SAC for one of a generator that learns from nothing."""
 
 
 def finetune(config: FinetuneConfig) -> dict[str, float]:
@@ -45,10 +47,13 @@ def finetune(config: FinetuneConfig) -> dict[str, float]:
     device = set_up(config.device, threads_of_half(config.threads))
     print(describe(device, config.threads), flush=True)
     torch.manual_seed(config.seed)
+    online = config.online
     if config.policy.path is None:
         if config.env.id is None:
             raise ConfigError("give --policy.path, a pretrained policy, or --env.id to start anew")
         agent, data = _from_nothing(config.env.id, config.seed)
+        if online.generator_every is None:
+            online = replace(online, generator_every=_GENERATOR_EVERY)
     else:
         agent = Agent.load(find_policy(config.policy.path))
         data = _dataset(config, agent)
@@ -63,7 +68,7 @@ def finetune(config: FinetuneConfig) -> dict[str, float]:
         agent.to(device),
         data,
         lambda count: make_worlds(agent, count),
-        config.online,
+        online,
         config.seed,
         device,
         config.threads,
@@ -78,7 +83,7 @@ def finetune(config: FinetuneConfig) -> dict[str, float]:
 
 def _check(config: FinetuneConfig) -> None:
     online = config.online
-    at_least(0, {"--seed": config.seed, "--online.generator-every": online.generator_every})
+    at_least(0, {"--seed": config.seed, "--online.generator-every": online.generator_every or 0})
     at_least(
         1,
         {

@@ -5,7 +5,12 @@ that is already reached, which is what the paper's failure analysis finds (its F
 
 ``likely`` first drops what leads nowhere: candidates that are where one is already, and those that
 the generator gives less than a tenth of the weight of its best. What is left are different ways on
-(which block next), and of these the one that is reached soonest is taken.
+(which block next), and of these it takes the one of highest
+
+    log w + V / 10,
+
+w its weight: V is minus the steps to it, about, and ten more of them count as e times less likely.
+By V alone the nearest is taken, be it likely or not: a drawer is shut again with nothing in it.
 """
 
 from __future__ import annotations
@@ -18,6 +23,7 @@ from torch import Tensor
 from pretrain.agent import Agent
 
 _LEAST_WEIGHT = math.log(0.1)
+_STEPS_PER_NAT = 10.0
 
 
 def select(
@@ -48,9 +54,10 @@ def select(
         way = (candidates - achieved_goal[:, None]).norm(dim=-1)
         trivial = way <= agent.config.subgoals.reached_m
         unlikely = likelihood < likelihood.amax(1, keepdim=True) + _LEAST_WEIGHT
-        score = score - _DROPPED * (trivial.float() + unlikely.float())
+        dropped = trivial.float() + unlikely.float()
+        score = likelihood + score / _STEPS_PER_NAT - _DROPPED * dropped
     return candidates[torch.arange(batch), score.argmax(1)]
 
 
-_DROPPED = 1e6
-"""More than any difference of values: dropped candidates come last."""
+_DROPPED = 1e4
+"""More than any difference of scores: dropped candidates come last."""

@@ -4,12 +4,13 @@ The paper's encoder is one Laplace over all objects at once. Between two stable 
 object moves (others perhaps with it), and which one is a choice among few: one Laplace must
 average over the choices, a mixture need not. So the explicit encoder is here
 
-    p(subgoal | s, g) = sum_i w_i(s, g) prod_j Laplace(subgoal_j; mean_ij, scale_ij),
+    p(subgoal | s, g) = sum_ik w_ik(s, g) prod_j Laplace(subgoal_j; mean_ikj, scale_ikj),
 
-component i being "object i moves", with mean_ij = place_j + gate_ij (goal_j - place_j) + shift_ij:
-an object stays, goes to its goal, or is put somewhere else. It is built from pairs of objects, so
-that interchangeable objects share all parameters. The implicit decoder, the likelihood and the
-divergence are the paper's.
+component ik being "object i moves, in the k-th of a few ways", with mean_ikj = place_j +
+gate_ikj (goal_j - place_j) + shift_ikj: an object stays, goes to its goal, or is put somewhere
+else. A single way would have to lie between the places where an object may go: a drawer half open.
+It is built from pairs of objects, so that interchangeable objects share all parameters. The
+implicit decoder, the likelihood and the divergence are the paper's.
 """
 
 from __future__ import annotations
@@ -53,8 +54,8 @@ class Movers(SubgoalProposer):
         # Two bodies: densities of places are worth many nats, the choice of an object less than
         # one, and would be drowned out in a shared one.
         self.choice = MLP(pair, (width,), width)
-        self.weight = MLP(layout.robot_dim + token + 2 * width, (width,), 1)
-        self.moves = MLP(pair, (width, width), 7)
+        self.weight = MLP(layout.robot_dim + token + 2 * width, (width,), config.modes)
+        self.moves = MLP(pair, (width, width), 7 * config.modes)
         self.decoder = MLP(layout.observation_dim + layout.goal_dim, (width,) * 2, layout.goal_dim)
         self.register_buffer("_same", torch.eye(count))
 
@@ -77,12 +78,13 @@ class Movers(SubgoalProposer):
         choice = torch.relu(self.choice(pairs))
         pooled = torch.cat([choice.mean(2), choice.amax(2)], -1)
         context = torch.cat([robot[:, None].expand(-1, count, -1), tokens, pooled], -1)
-        logits = self.weight(context).squeeze(-1)
-        gate, shift, spread = self.moves(pairs).split([1, 3, 3], -1)
-        way = other[..., 6:9]
+        logits = self.weight(context).flatten(1)
+        moves = self.moves(pairs).unflatten(-1, (self.config.modes, 7)).movedim(-2, 2)
+        gate, shift, spread = moves.split([1, 3, 3], -1)
+        way = other[..., 6:9].unsqueeze(2)
         mean = torch.sigmoid(gate) * way + shift
         scale = nn.functional.softplus(spread).clamp(max=_MOST_SCALE) + _LEAST_SCALE
-        return logits.log_softmax(-1), mean, scale
+        return logits.log_softmax(-1), mean.flatten(1, 2), scale.flatten(1, 2)
 
     def _relative(self, observation: Tensor, goal: Tensor) -> Tensor:
         """Return (B, n, 3): goals relative to where the objects are, decimetres."""
@@ -117,9 +119,11 @@ class Movers(SubgoalProposer):
         log_weight, mean, scale = self.components(observation, goal)
         target = self._relative(observation, subgoal)
         each = laplace.log_prob(target.flatten(1)[:, None], mean.flatten(2), scale.flatten(2))
-        # Which component it was is known in hindsight: that of the object that went furthest.
-        mover = target.norm(dim=-1).argmax(1, keepdim=True)
-        likelihood = (log_weight + each).gather(1, mover).squeeze(1)
+        # Who moved is known in hindsight, the object that went furthest; in which way is not.
+        mover = target.norm(dim=-1).argmax(1)
+        rows = torch.arange(len(mover), device=mover.device)
+        joint = (log_weight + each).unflatten(1, (-1, self.config.modes))
+        likelihood = joint[rows, mover].logsumexp(-1)
         sampled = laplace.sample(mean, scale)
         places = self._place(observation)[:, None] * _SCALE + sampled
         state = observation[:, None].expand(-1, places.shape[1], -1)

@@ -51,11 +51,20 @@ def test_candidates_that_are_reached_already_are_dropped():
 
 
 def test_candidates_far_less_likely_than_the_best_are_dropped():
-    agent = agent_that_values("likely", (1.0, 0.0))
+    agent = agent_that_values("likely", (100.0, 0.0))
     candidates = [[0.5, 0.0], [0.75, 0.0], [1.0, 0.0]]
     likelihood = torch.tensor([[0.5, 0.4, 0.01]]).log()
     assert choose(agent, candidates, likelihood) == [0.75, 0.0]
     assert choose(agent, candidates, torch.tensor([[0.5, 0.4, 0.3]]).log()) == [1.0, 0.0]
+
+
+@pytest.mark.parametrize("steps", [5.0, 15.0])
+def test_ten_steps_weigh_as_much_as_a_factor_e_of_likelihood(steps):
+    agent = agent_that_values("likely", (-steps, 0.0))
+    near_or_likely = choose(
+        agent, [[1.0, 0.0], [2.0, 0.0]], torch.tensor([[1.0, torch.e]]).log() - 2
+    )
+    assert near_or_likely == ([2.0, 0.0] if steps < 10 else [1.0, 0.0])
 
 
 def test_where_all_are_dropped_one_is_chosen_all_the_same():

@@ -100,9 +100,11 @@ def test_movers_treat_objects_of_a_kind_alike(task):
         there = list(order)
         other = proposer.components(*renamed(layout, order, observation, goal))
         close = {"atol": 1e-4, "rtol": 1e-4}
-        torch.testing.assert_close(other[0], log_weight[:, there], **close)
-        torch.testing.assert_close(other[1], mean[:, there][:, :, there], **close)
-        torch.testing.assert_close(other[2], scale[:, there][:, :, there], **close)
+        modes = proposer.config.modes
+        which = [i * modes + mode for i in there for mode in range(modes)]
+        torch.testing.assert_close(other[0], log_weight[:, which], **close)
+        torch.testing.assert_close(other[1], mean[:, which][:, :, there], **close)
+        torch.testing.assert_close(other[2], scale[:, which][:, :, there], **close)
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -130,12 +132,12 @@ def test_further_candidates_of_movers_scatter_as_the_temperature_says():
     for temperature in (0.0, 0.3, 1.0):
         proposer = generator("movers", "stack", movers=MoversConfig(8, temperature=temperature))
         torch.manual_seed(0)
-        candidates, log_prob = proposer.propose(observation, goal, 203)
-        means = candidates[:, :3]
-        drawn = candidates[:, 3:]
+        components = proposer.components(observation, goal)[0].shape[1]
+        candidates, log_prob = proposer.propose(observation, goal, components + 200)
+        means, drawn = candidates[:, :components], candidates[:, components:]
         apart = (drawn[:, :, None] - means[:, None]).norm(dim=-1).amin(-1)
         spread.append(apart.mean().item())
-        assert (log_prob[:, 3:, None] == log_prob[:, None, :3]).any(-1).all()
+        assert (log_prob[:, components:, None] == log_prob[:, None, :components]).any(-1).all()
     assert spread[0] < 1e-5 < spread[1] < spread[2]
 
 
