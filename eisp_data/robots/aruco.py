@@ -23,6 +23,11 @@ _PEAK = 3
 """Samples on each side of the steepest one that count."""
 _FAINT = 25.0
 """Grey levels across an edge below which it is none."""
+_RIM_SHARE = 0.15
+"""Of a marker's size, within which a rim around it ends. A rim in the shade is darker than the
+table, and then OpenCV finds its outline instead of the marker's."""
+_RIM_SAMPLES, _RIM_PLACES = 12, 6
+"""Across and along an edge."""
 _ROUNDS = 2
 _STRAY_PX = 0.35
 
@@ -80,43 +85,93 @@ def refine(grey: np.ndarray, corners: np.ndarray) -> np.ndarray:
     Returns:
         (M, 4, 2) px.
     """
+    corners = _without_rim(grey, corners)
     points, found = _edge_points(grey, corners)
     normals, offsets, good = _fit_lines(points, found)
+    fitted, crossing = _crossings(normals, offsets)
+    near = np.linalg.norm(fitted - corners, axis=-1) <= 2 * _REACH_PX
+    good = good & np.roll(good, 1, axis=1) & crossing & near
+    return np.where(good[..., None], fitted, corners)
+
+
+def _crossings(normals: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return where each of four lines crosses the one before it, (M, 4, 2), and whether it does.
+
+    Args:
+        normals: (M, 4, 2), of length 1.
+        offsets: (M, 4), of the lines from the origin along them.
+    """
     before_n, before_o = np.roll(normals, 1, axis=1), np.roll(offsets, 1, axis=1)
     cross = before_n[..., 0] * normals[..., 1] - before_n[..., 1] * normals[..., 0]
-    good = good & np.roll(good, 1, axis=1) & (np.abs(cross) > 0.1)
-    cross = np.where(good, cross, 1.0)
+    crossing = np.abs(cross) > 0.1
+    cross = np.where(crossing, cross, 1.0)
     x = (before_o * normals[..., 1] - offsets * before_n[..., 1]) / cross
     y = (before_n[..., 0] * offsets - normals[..., 0] * before_o) / cross
-    fitted = np.stack([x, y], axis=-1)
-    near = np.linalg.norm(fitted - corners, axis=-1) <= 2 * _REACH_PX
-    return np.where((good & near)[..., None], fitted, corners)
+    return np.stack([x, y], axis=-1), crossing
+
+
+def _without_rim(grey: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Return the corners (M, 4, 2), those of edges that are a rim's brought in to the marker's."""
+    length = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=-1)
+    size = (np.roll(length, 1, axis=1) + np.roll(length, -1, axis=1)) / 2
+    # Outwards as far as the fine search goes, inwards as far as a rim may be wide.
+    inwards = _REACH_PX + _RIM_SHARE * size
+    across = _REACH_PX - inwards[..., None] * np.linspace(1.0, 0.0, _RIM_SAMPLES)
+    places, outward, profile = _profiles(grey, corners, _RIM_PLACES, across)
+    rise = np.diff(profile.mean(axis=2), axis=-1)
+    steepest = rise.argmax(axis=-1)[..., None]
+    middle = (across[..., 1:] + across[..., :-1]) / 2
+    shift = np.take_along_axis(middle, steepest, axis=-1)[..., 0]
+    shift = np.where((shift < -_REACH_PX) & (rise.max(axis=-1) > _FAINT), shift, 0.0)
+    if not shift.any():
+        return corners
+    moved, crossing = _crossings(outward, (places[:, :, 0] * outward).sum(axis=-1) + shift)
+    return np.where(crossing[..., None], moved, corners)
 
 
 def _edge_points(grey: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return points (M, 4, S, 2) on the four edges of each marker, and which were found."""
-    import cv2
-
-    start, end = corners, np.roll(corners, -1, axis=1)
-    along = (end - start) / np.linalg.norm(end - start, axis=-1, keepdims=True)
-    outward = np.stack([along[..., 1], -along[..., 0]], axis=-1)
-    share = np.linspace(_FIRST, _LAST, _SAMPLES)
-    places = start[:, :, None] + (end - start)[:, :, None] * share[:, None]
     across = np.linspace(-_REACH_PX, _REACH_PX, _PROFILE)
-    pixels = (places[:, :, :, None] + outward[:, :, None, None] * across[:, None]).astype(
-        np.float32
+    places, outward, profile = _profiles(
+        grey, corners, _SAMPLES, np.broadcast_to(across, (*corners.shape[:2], _PROFILE))
     )
-    profile = cv2.remap(
-        grey, pixels[..., 0].reshape(-1, 1), pixels[..., 1].reshape(-1, 1), cv2.INTER_LINEAR
-    ).reshape(pixels.shape[:-1])
     # Dark inside, light outside.
-    rise = np.clip(np.diff(profile.astype(np.float64), axis=-1), 0.0, None)
+    rise = np.clip(np.diff(profile, axis=-1), 0.0, None)
     middle = (across[1:] + across[:-1]) / 2
     steepest = rise.argmax(axis=-1)[..., None]
     rise[np.abs(np.arange(_PROFILE - 1) - steepest) > _PEAK] = 0.0
     total = rise.sum(axis=-1)
     shift = (rise * middle).sum(axis=-1) / np.maximum(total, 1e-9)
     return places + outward[:, :, None] * shift[..., None], total > _FAINT
+
+
+def _profiles(
+    grey: np.ndarray, corners: np.ndarray, count: int, across: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the grey levels across the four edges of each marker.
+
+    Args:
+        grey: (H, W) uint8.
+        corners: (M, 4, 2) px.
+        count: S places along each edge.
+        across: (M, 4, P) px, outwards from the edge.
+
+    Returns:
+        The places (M, 4, S, 2) px, the edges' outward normals (M, 4, 2), the levels (M, 4, S, P).
+    """
+    import cv2
+
+    way = np.roll(corners, -1, axis=1) - corners
+    along = way / np.linalg.norm(way, axis=-1, keepdims=True)
+    outward = np.stack([along[..., 1], -along[..., 0]], axis=-1)
+    share = np.linspace(_FIRST, _LAST, count)
+    places = corners[:, :, None] + way[:, :, None] * share[:, None]
+    shifts = outward[:, :, None, None] * across[:, :, None, :, None]
+    pixels = (places[:, :, :, None] + shifts).astype(np.float32)
+    levels = cv2.remap(
+        grey, pixels[..., 0].reshape(-1, 1), pixels[..., 1].reshape(-1, 1), cv2.INTER_LINEAR
+    )
+    return places, outward, levels.reshape(pixels.shape[:-1]).astype(np.float64)
 
 
 def _fit_lines(points: np.ndarray, found: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -27,6 +27,7 @@ _MOST_PX = 1.2
 """A fit with a larger error is none."""
 _GOOD_PX = 0.35
 """A guess that leads to a fit so good needs no rival."""
+_QUARTER_TURN = transform(np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]), np.zeros(3))
 _STARTS = 2
 """How many markers, the largest first, are asked for a pose to start from."""
 
@@ -185,10 +186,12 @@ def _square_poses(view: View, marker: Marker, rays: np.ndarray) -> list[np.ndarr
 
     half = marker.size_m / 2
     square = half * np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+    # OpenCV garbles rotations by exactly half a turn, and so one sees the top of a block that lies
+    # straight: it is asked for the marker a quarter turn on.
     count, turns, shifts, _ = cv2.solvePnPGeneric(
-        square, rays[:, None], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE
+        square, np.roll(rays, 1, axis=0)[:, None], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE
     )
-    back = inverse(marker.transform_marker_to_object)
+    back = _QUARTER_TURN @ inverse(marker.transform_marker_to_object)
     return [
         view.transform_camera_to_task
         @ transform(cv2.Rodrigues(turns[i])[0], shifts[i].ravel())

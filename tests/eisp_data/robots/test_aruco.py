@@ -52,6 +52,17 @@ def test_an_edge_that_is_not_there_leaves_its_corners_alone(corners):
     np.testing.assert_array_equal(refine(image, corners[None]), corners[None])
 
 
+def test_a_rim_that_is_darker_than_the_table_is_not_taken_for_the_marker(corners):
+    image = picture(corners)
+    # The sticker is larger than the marker by 4 mm in 42 all around, and lies in the shade.
+    rim = corners.mean(axis=0) + 50 / 42 * (corners - corners.mean(axis=0))
+    on = np.zeros(image.shape[:2], np.uint8)
+    cv2.fillConvexPoly(on, np.round(rim).astype(np.int32), 1)
+    image[on == 1] = (0.65 * image[on == 1]).astype(np.uint8)
+    outer = refine(image[..., 0], rim[None])[0]
+    assert np.linalg.norm(outer - corners, axis=1).max() < 0.2
+
+
 def test_an_empty_image_has_no_markers():
     found = MarkerDetector().detect(np.full((120, 160, 3), 90, np.uint8))
     assert len(found.numbers) == len(found.corners) == 0
