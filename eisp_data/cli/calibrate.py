@@ -4,30 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from eisp_data.cli.run import run
 from eisp_data.config import at_least
 from eisp_data.errors import ConfigError
-
-if TYPE_CHECKING:
-    from eisp_data.robots.robot import Robot
+from eisp_data.robots.robot_config import RobotConfig, choose_camera, make_configured
 
 
-@dataclass(frozen=True)
-class CalibrateConfig:
+@dataclass(frozen=True, kw_only=True)
+class CalibrateConfig(RobotConfig):
     """Which cell, and how thoroughly."""
 
     output: Path
     """The calibration file to be written."""
-    robot: str = "twin"
-    """twin, ur3 or tiago."""
-    host: str | None = None
-    """Address of a real robot."""
-    camera_source: str | None = None
-    """Where a real robot's camera is: what OpenCV opens (0, a path), or a ROS topic for tiago."""
-    camera: str | None = None
-    """The camera that looks at the table; the only one if left out."""
     views: int = 30
     """Postures from which the board is shown."""
     seed: int = 0
@@ -53,10 +43,14 @@ def calibrate(config: CalibrateConfig) -> None:
 
     from eisp_data.robots.calibrate import calibrate_cell
     from eisp_data.robots.safe_robot import SafeRobot
+    from eisp_data.robots.twin.camera import CameraOptions
 
-    bare = _make(config)
+    off = CameraOptions(mounting_error=config.twin_mounting_error)
+    bare = make_configured(config, {"seed": config.seed, "camera": off, "board": True})
     with SafeRobot(bare) as robot:
-        camera = _camera(config, robot)
+        camera = choose_camera(config, robot)
+        if camera is None:
+            raise ConfigError(f"{robot.name} has no camera to calibrate: missing --camera-source")
         done = calibrate_cell(
             robot, camera, config.views, config.seed, lambda p: tqdm(p, "calibrating", unit="view")
         )
@@ -67,29 +61,6 @@ def calibrate(config: CalibrateConfig) -> None:
     print(f"  camera and joints   {quality['board_error_mm']:.2f} mm apart (median)")
     if hasattr(bare, "referee"):
         _judge(done, bare, camera)
-
-
-def _make(config: CalibrateConfig) -> Robot:
-    from eisp_data.robots.registry import ROBOTS, make_robot
-
-    options: dict[str, Any] = {}
-    if config.robot == "twin":
-        from eisp_data.robots.twin.camera import CameraOptions
-
-        off = CameraOptions(mounting_error=config.twin_mounting_error)
-        options = {"seed": config.seed, "camera": off, "board": True}
-    elif config.robot in ROBOTS:
-        if config.host is None:
-            raise ConfigError(f"--robot {config.robot}: missing --host, the robot's address")
-        options = {"host": config.host, "camera": config.camera_source}
-    return make_robot(config.robot, **options)
-
-
-def _camera(config: CalibrateConfig, robot: Robot) -> str:
-    names = list(robot.cameras)
-    if config.camera in names or (config.camera is None and len(names) == 1):
-        return config.camera or names[0]
-    raise ConfigError(f"--camera: choose one of {', '.join(names) or 'none: there is no camera'}")
 
 
 def _judge(done: Any, robot: Any, camera: str) -> None:

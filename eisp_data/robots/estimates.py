@@ -1,4 +1,4 @@
-"""What perception believes, and the same as the observation that policies learned from."""
+"""What perception believes, and the same as a state of the task's own simulation."""
 
 from __future__ import annotations
 
@@ -64,16 +64,6 @@ def state_from_estimates(task: Task, estimates: Estimates) -> np.ndarray:
         qvel[speed + 3 : speed + 6] = rotation.T @ block.spin
         place, speed = place + 7, speed + 6
     return state
-
-
-def observation_from_estimates(task: Task, estimates: Estimates) -> tuple[np.ndarray, np.ndarray]:
-    """Return the observation (S,) and the achieved goal (G,), float32, laid out by the task.
-
-    Raises:
-        RobotError: an object has not been seen yet.
-    """
-    state = state_from_estimates(task, estimates)[None]
-    return task.observe(state)[0], task.achieved_goal(state)[0]
 
 
 def upright(rotation: np.ndarray) -> np.ndarray:

@@ -9,9 +9,9 @@ import numpy as np
 
 from eisp_data.policies.registry import SCRIPTS
 from eisp_data.policies.script import Noise, ScriptedPolicy
+from eisp_data.robots.look import opening_action
 from eisp_data.robots.session_view import Seen
 from eisp_data.robots.teleop import Teleop
-from eisp_data.sim.scene import FINGER_TRAVEL_M
 from eisp_data.tasks.base import Task
 
 
@@ -28,7 +28,8 @@ class Decision:
     by_human: bool = False
     """A human has taken over from a script or a policy."""
     looking: bool = False
-    """The arm only gets out of the camera's way, or back from there."""
+    """Of a controller: what it needs next is a look at the table, not this action. Of a session:
+    the arm is getting out of the camera's way, or back from there."""
 
 
 class Controller(Protocol):
@@ -41,11 +42,6 @@ class Controller(Protocol):
 
     def act(self, seen: Seen) -> Decision:
         """Return what to do now."""
-
-
-def opening_action(opening_m: float) -> float:
-    """Return the fourth action that leaves the fingers where they are."""
-    return float(np.clip(opening_m / FINGER_TRAVEL_M - 1.0, -1.0, 1.0))
 
 
 class Human:
@@ -137,7 +133,8 @@ class Slowed:
             action = decision.action.copy()
             action[:3] /= self._ticks
             self._decision = replace(decision, action=action)
-        self._step += 1
+        # After a look it decides anew.
+        self._step = 0 if self._decision.looking else self._step + 1
         return self._decision
 
     def _stretched(self, seen: Seen) -> Seen:
@@ -148,7 +145,7 @@ class Slowed:
 
 
 class Limited:
-    """Ends the episode once the task's L steps have been taken; those of a look do not count."""
+    """Ends the episode once the task's L steps have been taken; a look is none."""
 
     def __init__(self, inner: Controller, steps: int) -> None:
         self.name = inner.name

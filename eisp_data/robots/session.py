@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from eisp_data.errors import RobotError
+from eisp_data.robots.look import FRESH_S, Look
 from eisp_data.robots.loop import Ticks
 from eisp_data.robots.motion import CartesianServo
 from eisp_data.robots.record_controllers import Controller, Decision
@@ -20,8 +21,8 @@ from eisp_data.tasks.base import GRIPPER_DIM, is_success
 
 _MET_TICKS = 12
 """An episode is a success once its goal has been met for half a second."""
-_LOOK_TICKS = 75
-"""Everything has to be seen within three seconds before an episode begins."""
+_STAND_TICKS = 8
+"""What is wrong with the first images is said before the arm moves."""
 _YIELD_SHARE = 0.6
 """Of a joint's greatest torque. In training 60 N was the most that the gripper could push with."""
 
@@ -71,12 +72,14 @@ class Session:
         self._fingers_closed = fingers_closed
         self._robot, self._log, self._stop = robot, log, stop
         self._servo = servo
-        self._sent, self._since_s = np.empty(0), 0.0
+        self._sent: np.ndarray | None = None
+        self._since_s = 0.0
         self.ticks = Ticks(robot, robot.control_hz)
         self.doing = "standing"
         self.say: Callable[[str], None] = lambda line: None
         self._goal = np.empty(0)
         self._subgoal: np.ndarray | None = None
+        self._look: Look | None = None
         self._subgoals, self._by_human, self._at_ns = 0, False, 0
 
     def run_episode(
@@ -102,6 +105,7 @@ class Session:
             RobotError: the robot or a camera does not answer, or something cannot be seen.
         """
         self._eyes, self._goal, self._subgoal = eyes, goal, None
+        self._look = self._sent = None
         self._subgoals, self._by_human = 0, False
         # The table may have been set anew: an image from before shows another one.
         self._since_s = self._robot.now_s()
@@ -118,16 +122,13 @@ class Session:
         return ended
 
     def _run(self, controller: Controller, most_ticks: int, seed: int, watch: Watch) -> Ended:
-        met, step, looked = 0, 0, 0
-        for at_ns in self.ticks.run(self._poll):
-            at_s, reading, self._at_ns = at_ns / 1e9, self._log.reading, at_ns
-            if missing := self._eyes.missing():
-                if self._stop.given:
-                    return Ended("", 0, float("nan"), 0)
-                looked += 1
-                self._check_sight(looked, missing)
-                continue
-            seen = self._eyes.see(at_s, reading)
+        ticks = self.ticks.run(self._poll)
+        if self._eyes.missing() and not self._look_first(ticks):
+            return Ended("", 0, float("nan"), 0)
+        met = 0
+        for step, at_ns in enumerate(ticks):
+            self._at_ns = at_ns
+            seen = self._eyes.see(at_ns / 1e9, self._log.reading)
             if step == 0:
                 self._begin(controller, seen, seed, at_ns)
             self._record(seen, at_ns)
@@ -135,22 +136,64 @@ class Session:
             ending = self._ending(step, most_ticks, met)
             if ending is not None:
                 return self._ended(ending, step, seen)
-            decision = controller.act(seen)
+            decision = self._decide(controller, seen)
             if decision.outcome:
                 return self._ended(decision.outcome, step, seen)
             self._note(decision, seen, step, at_ns)
             command = self._send(decision.action)
             self._record_sent(decision, command, at_ns)
             watch(step, seen, decision)
-            step += 1
         raise AssertionError("ticks never end")
+
+    def _look_first(self, ticks: Iterator[int]) -> bool:
+        """Get out of the camera's way until all is seen; False if somebody wants an end to it.
+
+        Raises:
+            RobotError: something is not to be seen from there either.
+        """
+        look: Look | None = None
+        for number, at_ns in enumerate(ticks):
+            self._at_ns = at_ns
+            reading, missing = self._log.reading, self._eyes.missing()
+            if self._stop.given:
+                return False
+            self.doing = f"looking for {', '.join(missing)}" if missing else "looking"
+            if number < _STAND_TICKS:
+                continue
+            here = self._servo.tool_in_task(reading.joint_position)
+            look = look or Look(here, lets_go=False)
+            in_sight = not missing and self._eyes.see(at_ns / 1e9, reading).age_s < FRESH_S
+            action = look.step(here, reading.gripper_opening_m, in_sight)
+            if action is None:
+                break
+            self._log.sent(self._send(action), at_ns)
+        if missing:
+            raise RobotError(f"the camera does not see {', '.join(missing)}")
+        return True
+
+    def _decide(self, controller: Controller, seen: Seen) -> Decision:
+        """Return what the controller decides, or how the look that it asked for goes on."""
+        if self._look is None:
+            decision = controller.act(seen)
+            if not decision.looking:
+                return decision
+            self._look = Look(seen.gripper_m, lets_go=not self._fingers_closed)
+        opening_m = seen.estimates.tool.opening_m
+        action = self._look.step(seen.gripper_m, opening_m, seen.age_s < FRESH_S)
+        if action is not None:
+            return Decision(action, looking=True)
+        self._look = None
+        return self._decide(controller, seen)
 
     def _send(self, action: np.ndarray) -> JointCommand:
         """Send an action; an arm that presses too hard against something gives way for a tick."""
         if self._fingers_closed:
             action = np.append(action[:3], -1.0)
-        wanted = self._servo.step(action, self._sent)
         reading = self._log.reading
+        if self._sent is None:
+            self._servo.start()
+            self._sent = reading.joint_position
+        wanted = self._servo.step(action, self._sent)
         if reading.joint_effort is not None:
             share = np.abs(reading.joint_effort) / self._robot.limits.effort
             if share.max() > _YIELD_SHARE:
@@ -168,20 +211,10 @@ class Session:
             fresh = {name: frame for name, frame in frames if frame.captured_s >= self._since_s}
             self._eyes.look(fresh, self._log.reading)
 
-    def _check_sight(self, looked: int, missing: list[str]) -> None:
-        self.doing = f"looking for {', '.join(missing)}"
-        if looked > _LOOK_TICKS:
-            raise RobotError(
-                f"cannot see {', '.join(missing)}: no marker of theirs was found within "
-                f"{_LOOK_TICKS / self._robot.control_hz:g} s"
-            )
-
     def _begin(self, controller: Controller, seen: Seen, seed: int, at_ns: int) -> None:
         self._log.event("episode_start", at_ns, policy=controller.name, seed=seed)
         if len(self._goal):
             self._log.vector("/desired_goal", self._goal, at_ns, role=GOAL)
-        self._servo.start()
-        self._sent = self._log.reading.joint_position
         controller.begin(seen, self._goal, seed)
 
     def _ending(self, step: int, most_ticks: int, met: int) -> str | None:

@@ -6,11 +6,12 @@ import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from eisp_data.errors import ConfigError, RobotError
+from eisp_data.robots.robot_config import RobotConfig, choose_camera, make_configured
 
 if TYPE_CHECKING:
     from eisp_data.robots.calibration import Calibration
@@ -26,21 +27,13 @@ _SLACK_M = 0.03
 
 
 @dataclass(frozen=True, kw_only=True)
-class CellConfig:
+class CellConfig(RobotConfig):
     """Which robot, before which table."""
 
-    robot: str = "twin"
-    """twin (a simulated UR3 cell), ur3 or tiago."""
     task: str | None = None
     """stack, push4, open_drawer or store; left out, nothing is looked for on the table."""
-    host: str | None = None
-    """Address of a real robot."""
-    camera_source: str | None = None
-    """Where a real robot's camera is: what OpenCV opens (0, a path), or a ROS topic for tiago."""
     calibration: Path | None = None
     """Calibration file of the cell; the twin has one of its own."""
-    camera: str | None = None
-    """The camera that looks at the table; the only one if left out."""
     realtime: bool = True
     """Whether the twin runs on the wall's time; if not, as fast as it can."""
     seed: int = 0
@@ -126,7 +119,8 @@ def open_cell(config: CellConfig) -> Iterator[Cell]:
     from eisp_data.tasks.registry import get_task
 
     task = None if config.task is None else get_task(config.task)
-    bare = _make(config)
+    twin = {"task": config.task or "stack", "realtime": config.realtime, "seed": config.seed}
+    bare = make_configured(config, twin)
     calibration = _calibration(config, bare)
     robot = SafeRobot(
         bare,
@@ -137,20 +131,9 @@ def open_cell(config: CellConfig) -> Iterator[Cell]:
         robot.calibrate()
         if config.calibration is not None:
             calibration.check(robot)
-        yield Cell(robot, task, calibration, _camera(config, robot), bare)
-
-
-def _make(config: CellConfig) -> Robot:
-    from eisp_data.robots.registry import ROBOTS, make_robot
-
-    options: dict[str, Any] = {}
-    if config.robot == "twin":
-        options = {"task": config.task or "stack", "realtime": config.realtime, "seed": config.seed}
-    elif config.robot in ROBOTS:
-        if config.host is None:
-            raise ConfigError(f"--robot {config.robot}: missing --host, the robot's address")
-        options = {"host": config.host, "camera": config.camera_source}
-    return make_robot(config.robot, **options)
+        looks = task is not None or config.camera is not None
+        camera = choose_camera(config, robot) if looks else None
+        yield Cell(robot, task, calibration, camera, bare)
 
 
 def _calibration(config: CellConfig, robot: Robot) -> Calibration:
@@ -166,17 +149,6 @@ def _calibration(config: CellConfig, robot: Robot) -> Calibration:
             f"--robot {config.robot}: missing --calibration, a file that eisp-calibrate writes"
         )
     return Calibration(robot.name, {})
-
-
-def _camera(config: CellConfig, robot: Robot) -> str | None:
-    names = list(robot.cameras)
-    if config.camera is not None and config.camera not in names:
-        raise ConfigError(
-            f"--camera {config.camera}: {robot.name} has {', '.join(names) or 'none'}"
-        )
-    if config.camera is None and len(names) > 1 and config.task is not None:
-        raise ConfigError(f"--camera: choose one of {', '.join(names)}")
-    return config.camera or (names[0] if names else None)
 
 
 def _check_reach(cell: Cell, goal: np.ndarray) -> None:

@@ -48,13 +48,13 @@ class Eyes(Protocol):
     """From readings and images to what is known."""
 
     def look(self, frames: dict[str, CameraFrame], reading: Reading) -> None:
-        """Take in the newest images."""
+        """Take in the newest images; RobotError where they cannot be of this cell."""
 
     def missing(self) -> list[str]:
         """Return what has not been seen yet."""
 
     def see(self, at_s: float, reading: Reading) -> Seen:
-        """Return what is known; RobotError where that cannot be this cell."""
+        """Return what is known, once nothing is missing."""
 
 
 class TaskEyes:
@@ -65,18 +65,17 @@ class TaskEyes:
         self._tracker = Tracker(task, calibration, camera, arm)
 
     def look(self, frames: dict[str, CameraFrame], reading: Reading) -> None:
-        """Take in the newest image."""
+        """Take in the newest image; RobotError where it cannot be of this cell."""
         self._tracker.update(reading, frames.get(self._camera))
+        self._tracker.check()
 
     def missing(self) -> list[str]:
         """Return what has not been seen yet."""
         return self._tracker.missing()
 
     def see(self, at_s: float, reading: Reading) -> Seen:
-        """Return what is known; RobotError where that cannot be this cell."""
-        estimates = self._tracker.update(reading)
-        self._tracker.check()
-        return seen(self._task, at_s, estimates)
+        """Return what is known, once nothing is missing."""
+        return seen(self._task, at_s, self._tracker.update(reading))
 
 
 class HandEyes:

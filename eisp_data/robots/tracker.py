@@ -105,17 +105,18 @@ class Tracker:
         return Estimates(tool=tool, objects=objects)
 
     def missing(self) -> list[str]:
-        """Return the objects that have not been seen yet."""
+        """Return the objects that have not been seen yet, with the numbers of their markers."""
         names = [name for name, block in self._blocks.items() if block.pose is None]
         if self._drawer is not None and self._drawer.opening_m is None:
             names.append("drawer")
-        return names
+        numbers = {name: [str(m.number) for m in self._marked[name].markers] for name in names}
+        return [f"{name} (markers {', '.join(numbers[name])})" for name in names]
 
     def check(self) -> None:
         """Raise RobotError where what the camera shows cannot be this cell.
 
-        A marker of no object is in view, an object has not been seen, or the markers on the table
-        are not where the calibration has them.
+        A marker of no object is in view, or the markers on the table are not where the calibration
+        has them.
         """
         if self._off_px is not None and self._off_px > _MOVED_PX:
             raise RobotError(
@@ -129,9 +130,6 @@ class Tracker:
                 f"unknown marker {', '.join(map(str, strange))} in view; this task has markers "
                 f"{', '.join(map(str, sorted(self._known)))}"
             )
-        for name in self.missing():
-            numbers = ", ".join(str(marker.number) for marker in self._marked[name].markers)
-            raise RobotError(f"the camera does not see {name}; its markers are {numbers}")
 
     def _see(self, frame: CameraFrame) -> None:
         found = self._detector.detect(frame.image)
@@ -173,15 +171,31 @@ class Tracker:
             # Freedom to tilt makes up for wrong corners, too: it has to explain much.
             if fit is None or (tilted is not None and tilted.error_px < 0.5 * fit.error_px):
                 return tilted
+        standing = self._stand(name, fit, rays)
+        if standing is not None:
+            return standing
+        if fit.transform_object_to_task[2, 3] > HALF_M and fit.error_px <= _FLYING_PX:
+            return fit
+        # Nothing sinks into the table, and hardly anything floats: sooner than that, a marker is
+        # half covered, and another one alone tells more.
+        rest = []
+        for marker in item.markers:
+            if marker.number in rays and len(item.markers) > 1:
+                alone = {marker.number: rays[marker.number]}
+                part = fit_pose(self._view, item, alone, guess, Priors(_TILT_STD))
+                rest.append(None if part is None else self._stand(name, part, alone))
+        return min(filter(None, rest), key=lambda part: part.error_px, default=None)
+
+    def _stand(self, name: str, fit: PoseFit, rays: dict[int, np.ndarray]) -> PoseFit | None:
+        """Return the pose on what it stands on, None if it is not at the height of anything."""
         pose = fit.transform_object_to_task
         slack = max(_STANDS_M, _STANDS_STD * fit.position_std_m)
         heights = [height + HALF_M for height in self._surfaces(name, pose)]
         height = min(heights, key=lambda h: abs(h - pose[2, 3]))
         if abs(height - pose[2, 3]) > slack:
-            # Nothing floats: sooner than that, a corner is covered.
-            return fit if fit.error_px <= _FLYING_PX else None
+            return None
         priors = Priors(_TILT_STD, height, _HEIGHT_STD_M)
-        standing = fit_pose(self._view, item, rays, pose, priors)
+        standing = fit_pose(self._view, self._marked[name], rays, pose, priors)
         stands = standing is not None and standing.error_px < max(_UPRIGHT_PX, 1.5 * fit.error_px)
         return standing if stands else fit
 

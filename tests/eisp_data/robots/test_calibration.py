@@ -121,7 +121,7 @@ def test_too_few_images_are_too_few():
 
 def test_the_command_finds_where_the_twins_camera_really_is(tmp_path, capsys):
     path = tmp_path / "cell.yaml"
-    command.calibrate(command.CalibrateConfig(path, views=14, seed=1))
+    command.calibrate(command.CalibrateConfig(output=path, views=14, seed=1))
     from eisp_data.robots.twin.camera import CameraOptions
     from eisp_data.robots.twin.robot import TwinRobot
 
@@ -160,10 +160,16 @@ def test_the_calibration_of_another_cell_is_refused(calibration, change, said):
 
 def test_a_bad_command_line_is_one_line(tmp_path):
     for config, said in (
-        (command.CalibrateConfig(tmp_path / "no/cell.yaml"), "there is no folder"),
-        (command.CalibrateConfig(tmp_path / "cell.yaml", views=0), "--views must be at least 1"),
-        (command.CalibrateConfig(tmp_path / "cell.yaml", robot="ur3"), "missing --host"),
-        (command.CalibrateConfig(tmp_path / "cell.yaml", camera="side"), "choose one of top"),
+        (command.CalibrateConfig(output=tmp_path / "no/cell.yaml"), "there is no folder"),
+        (
+            command.CalibrateConfig(output=tmp_path / "cell.yaml", views=0),
+            "--views must be at least 1",
+        ),
+        (command.CalibrateConfig(output=tmp_path / "cell.yaml", robot="ur3"), "missing --host"),
+        (
+            command.CalibrateConfig(output=tmp_path / "cell.yaml", camera="side"),
+            "choose one of top",
+        ),
     ):
         with pytest.raises(ConfigError, match=said):
             command.calibrate(config)

@@ -9,6 +9,7 @@ from eisp_data.errors import ConfigError
 from eisp_data.robots import models
 from eisp_data.robots.registry import ROBOTS, make_robot
 from eisp_data.robots.robot import Robot
+from eisp_data.robots.robot_config import RobotConfig, choose_camera, make_configured
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -45,3 +46,36 @@ def test_missing_models_name_their_extra(monkeypatch):
     monkeypatch.setattr(models, "_PACKAGE", "no-such-package")
     with pytest.raises(ConfigError, match=r"pip install 'eisp\[robot\]'"):
         models.models_folder()
+
+
+@pytest.mark.parametrize(("side", "arm"), [(None, "tiago_left"), ("right", "tiago_right")])
+def test_the_command_line_chooses_the_arm_of_a_tiago(side, arm):
+    config = RobotConfig(robot="tiago", host="127.0.0.1", side=side)
+    assert make_configured(config, {}).arm == arm
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (
+            {"robot": "ur3", "host": "127.0.0.1", "side": "right"},
+            "only tiago has two arms, not ur3",
+        ),
+        ({"robot": "tiago"}, "--robot tiago: missing --host"),
+        ({"robot": "r2d2"}, "unknown robot 'r2d2'; choose one of twin, ur3, tiago"),
+    ],
+)
+def test_a_robot_that_the_command_line_cannot_mean_is_one_line(options, said):
+    with pytest.raises(ConfigError, match=said):
+        make_configured(RobotConfig(**options), {})
+
+
+def test_a_camera_is_the_only_one_or_the_one_that_was_chosen():
+    robot = make_robot("ur3", host="127.0.0.1")
+    assert choose_camera(RobotConfig(), robot) is None
+    robot.cameras = dict.fromkeys(("top", "wrist"))
+    assert choose_camera(RobotConfig(camera="wrist"), robot) == "wrist"
+    with pytest.raises(ConfigError, match="missing --camera: choose one of top, wrist"):
+        choose_camera(RobotConfig(), robot)
+    with pytest.raises(ConfigError, match="--camera side: choose one of top, wrist"):
+        choose_camera(RobotConfig(camera="side"), robot)
