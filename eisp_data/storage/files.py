@@ -41,6 +41,15 @@ def replace_atomically(path: Path, write: Callable[[Path], object]) -> None:
         temporary.unlink(missing_ok=True)
 
 
+def remove_temporaries(folder: Path) -> None:
+    """Remove what ``replace_atomically`` leaves in and below a folder when it is killed.
+
+    To be called by who alone writes there.
+    """
+    for path in folder.rglob(".*.tmp"):
+        path.unlink(missing_ok=True)
+
+
 def json_text(value: Any) -> str:
     """Return ``value`` as indented JSON; NaN and infinities, which JSON has not, become null."""
 

@@ -16,7 +16,7 @@ from eisp_data.episode import Episode
 from eisp_data.errors import DataError
 from eisp_data.storage import batch as batches
 from eisp_data.storage.episodes import read_index
-from eisp_data.storage.files import WriterLock, read_json, sync, write_json
+from eisp_data.storage.files import WriterLock, read_json, remove_temporaries, sync, write_json
 from eisp_data.storage.meta import (
     SIDECAR_PATH,
     compact_episodes,
@@ -84,6 +84,7 @@ class DatasetWriter:
             self._stats: dict[str, Stats] = {}
             self.num_episodes = self.num_frames = self._next_file = 0
             self._started_empty = not exists
+            remove_temporaries(self.root / "meta")
             if exists:
                 self._recover()
             else:

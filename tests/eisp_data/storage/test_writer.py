@@ -17,6 +17,7 @@ from storage_samples import assert_same, random_episode, spec_of
 from eisp_data.episode import Episode
 from eisp_data.errors import DataError
 from eisp_data.storage.lerobot import DatasetWriter, read_episodes, read_recipe, read_spec
+from eisp_data.storage.validate import validate
 
 
 def test_every_array_comes_back_to_the_last_bit(make_dataset):
@@ -174,6 +175,16 @@ def test_an_interrupted_compaction_repeats_no_episode(make_dataset):
     assert len(list(read_episodes(root))) == len(episodes)
     DatasetWriter(root, spec_of(), {"policy": "script", "seed": 0}, resume=True).close()
     assert not first.with_name("file-001.parquet").exists()
+
+
+def test_what_a_kill_left_of_a_summary_half_written_is_removed_on_resume(make_dataset):
+    root, _ = make_dataset()
+    for name in ("meta/.info.json.7.tmp", "meta/episodes/chunk-000/.file-000.parquet.7.tmp"):
+        (root / name).write_bytes(b"PAR1")
+    assert [check.name for check in validate(root) if not check.passed] == ["no stray files"]
+    DatasetWriter(root, spec_of(), {"policy": "script", "seed": 0}, resume=True).close()
+    assert all(check.passed for check in validate(root))
+    assert not list(root.rglob("*.tmp"))
 
 
 def test_a_large_batch_is_cut_between_episodes(tmp_path, monkeypatch):
