@@ -73,7 +73,7 @@ class SubgoalConfig:
     source: Literal["generator", "random", "none", "oracle"] = "generator"
     """The generator, achieved goals drawn from the dataset, the final goal alone, or what the
     task's noise-free script would achieve next."""
-    candidates: int = 4
+    candidates: int = 8
     """K"""
     selector: Literal["value", "likely"] = "likely"
     """``value`` is the paper's Eq. (11); for ``likely`` see ``finetune.selector``."""

@@ -51,7 +51,7 @@ DEMONSTRATOR: dict[str, Noise] = {
         # A stumble while the drawer is being closed may slam it: the whole task by accident.
         stumble=0.004,
         partial=True,
-        whole_share=0.06,
+        whole_share=0.04,
         least_s=6.0,
     ),
 }

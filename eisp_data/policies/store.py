@@ -22,11 +22,16 @@ _TRAY_FLOOR_M = 0.030
 _WIDE_OPEN_M = 0.130
 _SHUT_M = 0.02
 _ATTEMPTS = 3
+_WHOLE_IN_WAY = 4
+"""How much more often the whole task is shown where it begins with a block in the way, which it
+seldom does: nothing else shows that the block comes first then, and goes where it does not belong.
+"""
 
 
 def store(view: View, aim: Aim) -> Iterator[Keyframe]:
     """Put the block away; a demonstrator does a part of it, others at places of its own."""
-    whole = not aim.noise.partial or aim.rng.random() < aim.noise.whole_share
+    share = aim.noise.whole_share * (_WHOLE_IN_WAY if _in_way(view) else 1)
+    whole = not aim.noise.partial or aim.rng.random() < share
     if whole:
         yield from _put_away(view, aim)
     while aim.noise.partial and view.time_s < aim.noise.least_s:
@@ -51,7 +56,7 @@ def _put_away(view: View, aim: Aim) -> Iterator[Keyframe]:
 def _clear(view: View, aim: Aim) -> Iterator[Keyframe]:
     """Push the block out of the drawer's way if it is in it."""
     x, y = view.blocks[0, :2]
-    if abs(y) < _IN_WAY_M:
+    if _in_way(view):
         yield from push_block(view, aim, np.array([x, np.copysign(_ASIDE_M, y)]))
 
 
@@ -81,6 +86,10 @@ def _own_part(view: View, aim: Aim) -> Iterator[Keyframe]:
         yield from slide_drawer(view, aim, opening)
     else:
         yield from slide_drawer(view, aim, 0.0)
+
+
+def _in_way(view: View) -> bool:
+    return bool(abs(view.blocks[0, 1]) < _IN_WAY_M)
 
 
 def _opening(view: View) -> float:
