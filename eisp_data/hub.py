@@ -21,6 +21,7 @@ from eisp_data.storage.card import CITATION, PREVIEW, dataset_card
 from eisp_data.storage.checks import Check
 from eisp_data.storage.files import one_line
 from eisp_data.storage.mcap.check import checks as recording_checks
+from eisp_data.storage.mcap.summary import recordings
 from eisp_data.storage.schema import CODEBASE_VERSION
 from eisp_data.storage.validate import validate
 from eisp_data.view import preview_png
@@ -96,7 +97,7 @@ def plan_push(
     kind = kind_of(path)
     if kind == "recording":
         raw = repo_id if repo_id.endswith("-raw") else f"{repo_id}-raw"
-        files = [path] if path.is_file() else sorted(path.glob("*.mcap"))
+        files = recordings(path)
         for file in files:  # what a recorder dropped is lost anyway: that is no reason to refuse
             _refuse_failed(file, [check for check in recording_checks(file) if check.name in WHOLE])
         return Plan(raw, "dataset", kind, [Item(file.name, file) for file in files])

@@ -91,7 +91,7 @@ def render(
         root: the dataset; cameras that it has already are kept, encoded once more.
         to: the new dataset's folder.
         cameras: name of a camera of the scene to (height, width) in pixels.
-        progress: called with the number of episodes after each batch.
+        progress: called with the number of episodes drawn, after each.
 
     Returns:
         How many episodes were written.
@@ -117,7 +117,7 @@ def render(
                 if size > _BATCH_BYTES:
                     writer.write(batch)
                     batch, size = [], 0
-                    progress(writer.num_episodes)
+                progress(writer.num_episodes + len(batch))
             writer.write(batch)
             count = writer.num_episodes
     finally:

@@ -15,7 +15,7 @@ class Repair:
     """Options of ``eisp-data repair``."""
 
     path: tyro.conf.Positional[Path]
-    """A dataset's folder or an MCAP file; it is only read."""
+    """A dataset's folder, an MCAP file, or the folder of one; it is only read."""
     to: Path | None = None
     """Where the whole copy goes; beside the original if left out."""
     in_place: bool = False
@@ -34,19 +34,22 @@ class Merge:
 
 def repair(options: tyro.conf.OmitArgPrefixes[Repair]) -> None:
     """Make a whole copy of a damaged dataset or recording; print what was kept and lost."""
-    if options.path.is_dir():
-        from eisp_data.storage.repair import repair as repair_dataset
+    from eisp_data.storage.mcap.repair import repair as repair_recording
+    from eisp_data.storage.mcap.summary import recordings
+    from eisp_data.storage.repair import repair as repair_dataset
 
-        lines = repair_dataset(options.path, options.to, options.in_place).lines()
-    elif options.path.is_file():
-        from eisp_data.storage.mcap.repair import repair as repair_recording
-
-        if options.in_place:
-            raise DataError("--in-place is for datasets; a recording is repaired into a copy")
-        lines = repair_recording(options.path, options.to).lines()
-    else:
-        raise DataError(f"{options.path}: no such file or folder")
-    print("\n".join(lines))
+    files = recordings(options.path)
+    if files and options.in_place:
+        raise DataError("--in-place is for datasets; a recording is repaired into a copy")
+    if len(files) > 1:
+        names = ", ".join(file.name for file in files)
+        raise DataError(f"{options.path}: name one of its recordings: {names}")
+    report = (
+        repair_recording(files[0], options.to)
+        if files
+        else repair_dataset(options.path, options.to, options.in_place)
+    )
+    print("\n".join(report.lines()))
 
 
 def merge(options: tyro.conf.OmitArgPrefixes[Merge]) -> None:

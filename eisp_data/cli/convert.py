@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
-from tqdm import tqdm
 
+from eisp_data.cli.progress import counting
 from eisp_data.storage.mcap.convert import ConvertConfig, suggested_mapping
 from eisp_data.storage.mcap.convert import convert as convert_recordings
 
@@ -28,8 +28,8 @@ def convert(options: tyro.conf.OmitArgPrefixes[Convert]) -> None:
     if options.show_mapping:
         print(suggested_mapping(options), end="")
         return
-    with tqdm(desc="episodes", unit="") as bar:
-        report = convert_recordings(options, lambda episodes: bar.update(episodes - bar.n) and None)
+    with counting("converting") as show:
+        report = convert_recordings(options, show)
     for line in report.lines:
         print(line)
     print(f"{report.episodes} episodes, {report.frames} frames in {options.to}")

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import tyro
 
-from eisp_data.errors import DataError
 from eisp_data.storage.files import json_text
 
 
@@ -18,7 +19,7 @@ class Info:
     """Options of ``eisp-data info``."""
 
     path: tyro.conf.Positional[Path]
-    """The dataset's folder."""
+    """A dataset's folder, an MCAP file, or a folder of them (a ROS 2 bag)."""
     json: bool = False
     """Print it as JSON."""
 
@@ -28,38 +29,57 @@ class Validate:
     """Options of ``eisp-data validate``."""
 
     path: tyro.conf.Positional[Path]
-    """A dataset's folder or an MCAP file."""
+    """A dataset's folder, an MCAP file, or a folder of them (a ROS 2 bag)."""
 
 
 def info(options: tyro.conf.OmitArgPrefixes[Info]) -> None:
-    """Print what a dataset holds: task, shapes, sizes, success, recipe."""
-    from eisp_data.storage.summary import summary
+    """Print what a dataset or a recording holds: task, shapes, sizes, success, channels."""
+    from eisp_data.storage.mcap.summary import recordings
+    from eisp_data.storage.mcap.summary import summary as of_recording
+    from eisp_data.storage.summary import summary as of_dataset
 
-    facts = summary(options.path)
+    files = recordings(options.path)
+    found = [of_recording(file) for file in files] or [of_dataset(options.path)]
     if options.json:
-        print(json_text(facts))
+        print(json_text(found if len(found) > 1 else found[0]))
         return
+    print("\n\n".join("\n".join(_table(facts)) for facts in found))
+
+
+def _table(facts: Mapping[str, Any]) -> list[str]:
+    """Return names and values as aligned lines; a table within has lines of its own."""
     width = max(map(len, facts))
+    lines = []
     for name, value in facts.items():
-        text = json.dumps(value, ensure_ascii=False) if isinstance(value, dict | list) else value
-        print(f"{name:{width}}  {text}")
+        if isinstance(value, dict) and value and all(isinstance(v, dict) for v in value.values()):
+            rows = [[key, *map(str, row.values())] for key, row in value.items()]
+            rows.insert(0, ["", *next(iter(value.values()))])
+            widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+            lines.append(name)
+            lines += ["  " + "  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+        else:
+            text = (
+                json.dumps(value, ensure_ascii=False) if isinstance(value, dict | list) else value
+            )
+            lines.append(f"{name:{width}}  {text}")
+    return lines
 
 
 def validate(options: tyro.conf.OmitArgPrefixes[Validate]) -> None:
     """Run every check and print each with its result; exit with status 1 if one failed."""
     from eisp_data.storage import checks
+    from eisp_data.storage.mcap.check import checks as check_recording
+    from eisp_data.storage.mcap.summary import recordings
+    from eisp_data.storage.validate import validate as check_dataset
 
-    if options.path.is_dir():
-        from eisp_data.storage.validate import validate as check_dataset
-
-        results = check_dataset(options.path)
-    elif options.path.is_file():
-        from eisp_data.storage.mcap.check import checks as check_recording
-
-        results = check_recording(options.path)
-    else:
-        raise DataError(f"{options.path}: no such file or folder")
-    print("\n".join(checks.table(results)))
+    results = []
+    files = recordings(options.path)
+    for path in files or [options.path]:
+        if len(files) > 1:
+            print(f"{path}:")
+        found = check_recording(path) if files else check_dataset(path)
+        print("\n".join(checks.table(found)))
+        results += found
     failed = sum(not check.passed for check in results)
     warned = sum(check.passed and check.warning for check in results)
     print(f"{len(results)} checks, {failed} failed, {warned} to look at")

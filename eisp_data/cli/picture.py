@@ -66,16 +66,11 @@ def replay(options: tyro.conf.OmitArgPrefixes[Replay]) -> None:
 
 def render(options: tyro.conf.OmitArgPrefixes[Render]) -> None:
     """Write a copy of a dataset with camera images, drawn from its simulator states."""
-    from tqdm import tqdm
-
+    from eisp_data.cli.progress import counting
     from eisp_data.replay import render as draw
 
     cameras = {name: (options.height, options.width) for name in options.cameras}
-    with tqdm(desc="episodes", unit="") as bar:
-
-        def show(episodes: int) -> None:
-            bar.update(episodes - bar.n)
-
+    with counting("drawing") as show:
         count = draw(options.path, options.to, cameras, show)
     print(f"{count} episodes in {options.to}")
 

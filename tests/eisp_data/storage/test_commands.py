@@ -98,7 +98,7 @@ def test_help_names_every_command(eisp_data):
     ("words", "said"),
     [
         (["fly"], "unknown command 'fly'; choose one of info, validate"),
-        (["info", "/nowhere"], "/nowhere: not a LeRobot dataset"),
+        (["info", "/nowhere"], "/nowhere: no such file or folder"),
         (["validate", "/nowhere"], "/nowhere: no such file or folder"),
         (["merge", "/nowhere", "--to", "/tmp/x"], "/nowhere: not a LeRobot dataset"),
         (["repair", "/nowhere"], "/nowhere: no such file or folder"),
