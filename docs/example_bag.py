@@ -39,6 +39,8 @@ START_NS = 1_700_000_000_000_000_000
 LATENCY_NS = 4_000_000
 """How long after the time in its header a message is recorded."""
 CAMERA_PIXELS = 96
+FALLEN_M = -0.05
+"""A block below this height has fallen off the table, and the simulator has no floor."""
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 Message = tuple[str, str, Any]
 """Topic, type and message."""
@@ -99,7 +101,15 @@ def messages(episode: Episode, start: int, camera: Pixels | None) -> Iterator[tu
             yield at, picture(camera.draw(episode.sim_state[step : step + 1])[0], at)
         if step < len(episode):
             yield at, numbers("/command", episode.action[step])
-    yield at, text(f"episode_end outcome={'success' if episode.success[-1] else 'failure'}")
+    yield at, text(f"episode_end outcome={outcome(episode)}")
+
+
+def outcome(episode: Episode) -> str:
+    """Return what whoever watches says at the end; ``discard`` keeps it out of the dataset."""
+    heights = episode.achieved_goal.reshape(-1, 3)[:, 2]
+    if heights.min() < FALLEN_M:
+        return "discard"
+    return "success" if episode.success[-1] else "failure"
 
 
 def make(kind: str, *fields: Any) -> Any:

@@ -1,4 +1,4 @@
-"""What the numbers of a dataset look like: channels that are stuck, lag, success, extremes."""
+"""What the numbers of a dataset look like: stuck channels, outliers, lag, success, extremes."""
 
 from __future__ import annotations
 
@@ -18,6 +18,13 @@ LARGEST_LAG = 10
 SUSPICIOUS_LAG = 3
 """Steps between an action and its effect; more smells of clocks that disagree."""
 CLEAR_CORRELATION = 0.3
+COMMANDED = ("observation.state", "action")
+"""Columns that move in every episode."""
+MEASURED = ("observation.state", "observation.environment_state", "observation.achieved_goal")
+FAR_WIDTHS = 20
+"""A value is far out if it is this many widths of its usual range beyond that range."""
+LEAST_WIDTH = 1e-2
+"""The least that counts as the width of a range: 1 cm where it is a length."""
 
 
 class Collected:
@@ -30,7 +37,8 @@ class Collected:
         """Column to its (D,) minimum and maximum."""
         self.repeated = {name: 0 for name in spec.extras if name.startswith(REPEATED)}
         """Column of a recording's camera to how many rows repeat a frame."""
-        self._moves: dict[str, list[np.ndarray]] = {"observation.state": [], "action": []}
+        self._ranges: dict[str, list[np.ndarray]] = {name: [] for name in (*MEASURED, "action")}
+        """Column to (2, D) minimum and maximum of each episode."""
         self._lengths: list[int] = []
         self._pairs: list[tuple[np.ndarray, np.ndarray]] = []
         self._paired = 0
@@ -51,8 +59,10 @@ class Collected:
                 self.repeated[name] += int(np.count_nonzero(table > 0))
         for offset, start in enumerate(block.starts[:-1]):
             rows = slice(int(start), int(block.starts[offset + 1]))
-            for name, moves in self._moves.items():
-                moves.append(np.ptp(as_table(block.columns[name][rows]), axis=0) > 0)
+            for name, ranges in self._ranges.items():
+                if name in block.columns:
+                    table = as_table(block.columns[name][rows])
+                    ranges.append(np.stack([table.min(axis=0), table.max(axis=0)]))
             self._lengths.append(rows.stop - rows.start)
             success = block.columns["next.success"][rows]
             self._last.append(bool(success[-1]))
@@ -66,15 +76,35 @@ class Collected:
     def stuck(self) -> Check:
         """Find channels that move in most episodes and not at all in a long one."""
         found = []
-        for name, moves in self._moves.items():
-            moved = np.stack(moves)
+        for name in COMMANDED:
+            low, high = np.stack(self._ranges[name], axis=1)
+            moved = high > low
             usual = moved.mean(axis=0) > 0.5
             for episode, component in np.argwhere(~moved & usual):
                 if self._lengths[episode] >= STUCK_STEPS:
                     found.append(f"{name}[{component}] in episode {episode}")
-        more = f" and {len(found) - 3} more" if len(found) > 3 else ""
-        detail = ", ".join(found[:3]) + more or "none"
-        return Check("stuck channels", True, detail, warning=bool(found))
+        return Check("stuck channels", True, _first(found), warning=bool(found))
+
+    def outliers(self) -> Check:
+        """Find episodes in which something is far from where it is in most others.
+
+        One object that falls without end spoils the standardisation of the whole dataset.
+        """
+        found = []
+        for name in MEASURED:
+            if not self._ranges[name]:
+                continue
+            low, high = np.stack(self._ranges[name], axis=1).astype(np.float64)
+            usual_low, usual_high = np.median(low, axis=0), np.median(high, axis=0)
+            reach = FAR_WIDTHS * np.maximum(usual_high - usual_low, LEAST_WIDTH)
+            far = np.where(usual_low - low > high - usual_high, low, high)
+            beyond = np.maximum(usual_low - low, high - usual_high) > reach
+            found += [
+                f"{name}[{component}] is {far[episode, component]:.4g} in episode {episode}, in "
+                f"most {usual_low[component]:.3g} to {usual_high[component]:.3g}"
+                for episode, component in np.argwhere(beyond)
+            ]
+        return Check("outliers", True, _first(found), warning=bool(found))
 
     def repeats(self) -> Check:
         """Count the rows that repeat a camera's frame because the next one was lost."""
@@ -110,6 +140,12 @@ class Collected:
             f"{at_last} of {count} at the last observation ({at_last / count:.1%}), "
             f"{at_any} at any ({at_any / count:.1%})"
         )
+
+
+def _first(found: list[str]) -> str:
+    """Return the first of what was found as one text."""
+    more = f" and {len(found) - 3} more" if len(found) > 3 else ""
+    return ", ".join(found[:3]) + more or "none"
 
 
 def _correlation(pairs: list[tuple[np.ndarray, np.ndarray]], lag: int) -> float:

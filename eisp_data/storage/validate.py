@@ -104,6 +104,7 @@ def _check_rows(
     if "no NaN" not in wrong:
         run("statistics", lambda: _statistics(root, collected))
         run("stuck channels", collected.stuck)
+        run("outliers", collected.outliers)
         run("action lag", collected.lag)
     if collected.repeated:
         run("repeated frames", collected.repeats)

@@ -190,6 +190,18 @@ def test_a_stuck_channel_and_a_late_action_are_pointed_out(tmp_path):
     assert warned["action lag"].startswith("5 step(s), 200 ms")
 
 
+def test_an_object_that_fell_off_the_table_is_pointed_out(tmp_path):
+    spec = spec_of()
+    episodes = [random_episode(spec, 30, seed) for seed in range(5)]
+    episodes[3].achieved_goal[:, 2] -= 300 * np.linspace(0, 1, 31, dtype=np.float32) ** 2
+    with DatasetWriter(tmp_path / "d", spec, {}) as writer:
+        writer.write(episodes)
+    warned = {check.name: check.detail for check in validate(tmp_path / "d") if check.warning}
+    assert list(warned) == ["outliers"]
+    assert "observation.achieved_goal[2] is -2" in warned["outliers"]
+    assert "in episode 3, in most -" in warned["outliers"] and "more" not in warned["outliers"]
+
+
 def mutate(data: bytes, rng: np.random.Generator) -> bytes:
     """Return a file cut short, emptied, with bits flipped, a stretch zeroed or doubled."""
     if not data:
