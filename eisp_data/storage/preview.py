@@ -31,7 +31,8 @@ def preview_png(root: Path, episodes: int = 6) -> bytes:
         for number in chosen:
             last = round(float(index.video_start_s[camera][number]) * spec.fps)
             last += int(index.length[number]) - 1
-            frames += decode_video(index.video_path(number, camera), last, last + 1, spec.fps)
+            path, size = index.video_path(number, camera), spec.cameras[camera]
+            frames += decode_video(path, last, last + 1, spec.fps, size)
         return _png(np.concatenate(frames, axis=1))
     return _paths(root, chosen)
 

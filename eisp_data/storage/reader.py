@@ -180,12 +180,12 @@ def _images(
     index: EpisodeIndex, number: int, sidecar: Sidecar, spec: DatasetSpec
 ) -> dict[str, np.ndarray]:
     images = {}
-    for camera in spec.cameras:
+    for camera, size in spec.cameras.items():
         if camera not in index.video_file:
             raise DataError(f"{index.root}: episode {number}: no video of camera {camera!r}")
         start = round(float(index.video_start_s[camera][number]) * spec.fps)
         stop = start + int(index.length[number])
-        frames = decode_video(index.video_path(number, camera), start, stop, spec.fps)
+        frames = decode_video(index.video_path(number, camera), start, stop, spec.fps, size)
         images[camera] = np.stack([*frames, sidecar.image(camera)])
     return images
 

@@ -266,7 +266,8 @@ def _locate(
 
 def _check_video(videos: dict[str, tuple[Path, int]], sidecar: Sidecar) -> None:
     """Decode an episode's first and last frame; DataError if that fails."""
-    for path, start in videos.values():
+    for camera, (path, start) in videos.items():
+        size = sidecar.spec.cameras[camera]
         for frame in (start, start + sidecar.steps - 1):
-            for _ in decode_video(path, frame, frame + 1, sidecar.spec.fps):
+            for _ in decode_video(path, frame, frame + 1, sidecar.spec.fps, size):
                 pass

@@ -177,9 +177,7 @@ class Rewriter:
         steps = len(columns["index"])
         if video_stats is None:
             video_stats = {
-                video_key(camera): image_stats(
-                    np.stack(list(decode_video(path, start, start + steps, self._spec.fps)))
-                )
+                video_key(camera): image_stats(self._frames_of(camera, path, start, steps))
                 for camera, (path, start) in videos.items()
             }
         self._part.columns.append(columns)
@@ -189,6 +187,11 @@ class Rewriter:
         self._part.bytes += sum(values.nbytes for values in columns.values())
         if self._part.bytes > PART_BYTES:
             self._flush()
+
+    def _frames_of(self, camera: str, path: Path, start: int, steps: int) -> np.ndarray:
+        """Return an episode's (T, H, W, 3) frames of a camera."""
+        size = self._spec.cameras[camera]
+        return np.stack(list(decode_video(path, start, start + steps, self._spec.fps, size)))
 
     def _copy_videos(self, videos: Mapping[str, tuple[Path, int]]) -> dict[str, tuple[int, int]]:
         """Return camera to (new file, first frame), having copied the files where needed."""

@@ -49,8 +49,14 @@ class Sidecar:
     recipe: dict[str, Any]
 
     def image(self, camera: str) -> np.ndarray:
-        """Return the last image of a camera, (H, W, 3) uint8."""
-        return decode_jpeg(self.images[camera])
+        """Return the last image of a camera, (H, W, 3) uint8; DataError if it is another size."""
+        image, (height, width) = decode_jpeg(self.images[camera]), self.spec.cameras[camera]
+        if image.shape != (height, width, 3):
+            raise DataError(
+                f"the last image of camera {camera!r} is {image.shape[0]} x {image.shape[1]} "
+                f"pixels, not {height} x {width}"
+            )
+        return image
 
 
 def plain_info(info: Mapping[str, Any]) -> dict[str, Scalar]:

@@ -220,11 +220,11 @@ def _video_counts(index: EpisodeIndex, spec: DatasetSpec) -> str:
 
 
 def _video_ends(index: EpisodeIndex, spec: DatasetSpec) -> str:
-    for camera in spec.cameras:
+    for camera, size in spec.cameras.items():
         for episode in range(len(index)):
             start = round(float(index.video_start_s[camera][episode]) * spec.fps)
             path = index.video_path(episode, camera)
             for frame in (start, start + int(index.length[episode]) - 1):
-                for _ in decode_video(path, frame, frame + 1, spec.fps):
+                for _ in decode_video(path, frame, frame + 1, spec.fps, size):
                     pass
     return f"first and last frame of {len(index)} episodes decode; those between were not tried"

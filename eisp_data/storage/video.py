@@ -81,11 +81,14 @@ def encode_video(path: Path, frames: Iterable[np.ndarray], fps: int, threads: in
     return count
 
 
-def decode_video(path: Path, start: int, stop: int, fps: int) -> Iterator[np.ndarray]:
-    """Yield frames ``start`` to ``stop - 1`` of a video as (H, W, 3) uint8 RGB.
+def decode_video(
+    path: Path, start: int, stop: int, fps: int, size: tuple[int, int]
+) -> Iterator[np.ndarray]:
+    """Yield frames ``start`` to ``stop - 1`` of a video as (H, W, 3) uint8 RGB, H x W its size.
 
     Raises:
-        DataError: the file is missing or damaged, or has fewer frames; the text names both.
+        DataError: the file is missing or damaged, has fewer frames, or a frame of another size
+            (a header says one size, the stream itself may say another); the text names both.
     """
     import av
 
@@ -102,6 +105,11 @@ def decode_video(path: Path, start: int, stop: int, fps: int) -> Iterator[np.nda
                     continue
                 if wanted >= stop:
                     break
+                if (frame.height, frame.width) != size:
+                    raise DataError(
+                        f"{path}: frame {wanted} is {frame.height} x {frame.width} pixels, not "
+                        f"{size[0]} x {size[1]}"
+                    )
                 yield frame.to_ndarray(format="rgb24")
                 wanted += 1
     except (av.FFmpegError, OSError, ValueError, IndexError, AttributeError) as error:
@@ -142,6 +150,6 @@ def decode_jpeg(data: bytes) -> np.ndarray:
     from PIL import Image
 
     try:
-        return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
-    except (OSError, ValueError, SyntaxError) as error:
+        return np.asarray(Image.open(io.BytesIO(data), formats=("JPEG",)).convert("RGB"))
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise DataError(f"a JPEG image cannot be decoded ({one_line(error)})") from None

@@ -17,11 +17,13 @@ import pyarrow.parquet as pq
 import pytest
 from storage_samples import assert_same, random_episode, spec_of
 
-from eisp_data.errors import EispError
+from eisp_data.errors import DataError, EispError
 from eisp_data.storage.cache import load_arrays
 from eisp_data.storage.lerobot import DatasetWriter, read_episodes
+from eisp_data.storage.preview import preview_png
 from eisp_data.storage.repair import repair
 from eisp_data.storage.validate import validate
+from eisp_data.storage.video import encode_video
 
 MUTATIONS = int(os.environ.get("EISP_MUTATIONS", "40"))
 MEMORY_BYTES = 700 * 2**20
@@ -115,6 +117,16 @@ class TestEachKindOfDamage:
         report = repair(root)
         assert report.episodes == 2 and len(report.lost) == 3
         assert failed(report.copy) == set()
+
+    def test_a_video_of_another_size(self, make_dataset):
+        root, _ = make_dataset(cameras=True)
+        path = root / "videos/observation.images.top/chunk-000/file-001.mp4"
+        encode_video(path, np.zeros((27, 32, 64, 3), np.uint8), 25)
+        assert {"video frames", "video ends"} <= failed(root)
+        for attempt in (lambda: list(read_episodes(root, images=True)), lambda: preview_png(root)):
+            with pytest.raises(DataError, match="is 32 x 64 pixels, not 48 x 48"):
+                attempt()
+        assert repair(root).episodes == 2
 
     def test_bits_of_one_row_group_cost_one_episode(self, make_dataset):
         root, _ = make_dataset()
