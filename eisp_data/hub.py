@@ -6,18 +6,18 @@ The endpoint and the token come from where ``huggingface_hub`` looks for them: `
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, Literal
 
 from eisp_data.errors import ConfigError, DataError
-from eisp_data.storage.card import CITATION, PREVIEW, dataset_card
+from eisp_data.hub_trust import refuse_path, refuse_pickle, verify
+from eisp_data.storage.card import CARD, CITATION, PREVIEW, dataset_card, policy_card
 from eisp_data.storage.checks import Check
 from eisp_data.storage.files import one_line
 from eisp_data.storage.mcap.check import checks as recording_checks
@@ -30,8 +30,6 @@ Kind = Literal["dataset", "recording", "policy"]
 DATASET_FOLDERS = ("data", "meta", "videos")
 WHOLE = ("whole", "message count")
 """Checks of a recording that must pass before it is sent."""
-PICKLED = (".pkl", ".pickle", ".pt", ".pth", ".bin", ".ckpt", ".joblib", ".dill", ".npy", ".npz")
-"""Endings of files whose loading can run code."""
 
 
 @dataclass(frozen=True)
@@ -85,8 +83,9 @@ def plan_push(
 ) -> Plan:
     """Return what ``push`` would send, having checked all of it; nothing is sent.
 
-    A dataset must pass every check of ``validate``; a card and a preview are made for it. MCAP
-    recordings must be whole, and go to a repository of their own, whose name ends in ``-raw``.
+    A dataset must pass every check of ``validate``; a card and a preview are made for it, and a
+    card for a policy, unless they have their own. MCAP recordings must be whole, and go to a
+    repository of their own, whose name ends in ``-raw``.
 
     Raises:
         DataError: a check fails (its name and detail), or a policy holds a pickled file.
@@ -104,17 +103,19 @@ def plan_push(
     if kind == "policy":
         items = [Item(p.relative_to(path).as_posix(), p) for p in _files(path)]
         for item in items:
-            _refuse_pickle(item.path, path / item.path)
+            refuse_pickle(item.path, path / item.path)
+        if CARD not in [item.path for item in items]:
+            items.append(Item(CARD, policy_card(path, license_name, citation).encode()))
         return Plan(repo_id, "model", kind, items)
     _refuse_failed(path, validate(path))
     items = [
         Item(p.relative_to(path).as_posix(), p) for f in DATASET_FOLDERS for p in _files(path / f)
     ]
-    own = path / "README.md"
+    own = path / CARD
     card = (
         own.read_bytes() if own.is_file() else dataset_card(path, license_name, citation).encode()
     )
-    items += [Item("README.md", card), Item(PREVIEW, preview_png(path))]
+    items += [Item(CARD, card), Item(PREVIEW, preview_png(path))]
     return Plan(repo_id, "dataset", kind, items, tag=CODEBASE_VERSION)
 
 
@@ -196,7 +197,7 @@ def pull(repo_id: str, to: Path, repo_type: str = "dataset", revision: str | Non
                 if hasattr(entry, "size")
             ]
             for entry in entries:
-                _refuse_path(entry.path)
+                refuse_path(entry.path)
             total = sum(entry.size for entry in entries)
             partial.mkdir(parents=True)
             if shutil.disk_usage(partial).free < total:
@@ -205,7 +206,7 @@ def pull(repo_id: str, to: Path, repo_type: str = "dataset", revision: str | Non
                 api.hf_hub_download(
                     repo_id, entry.path, repo_type=repo_type, revision=commit, local_dir=partial
                 )
-                _verify(partial / entry.path, entry)
+                verify(partial / entry.path, entry)
         # Its download notes would make LeRobot fetch the dataset again.
         shutil.rmtree(partial / ".cache", ignore_errors=True)
         if (partial / "meta/info.json").is_file():
@@ -235,50 +236,11 @@ def _files(folder: Path) -> list[Path]:
     )
 
 
-def _refuse_path(path: str) -> None:
-    """Raise DataError for a path that leaves the folder or names a pickled file."""
-    parts = PurePosixPath(path).parts
-    if (
-        not parts
-        or path.startswith("/")
-        or ".." in parts
-        or "\\" in path
-        or ":" in parts[0]
-        or "\0" in path
-    ):
-        raise DataError(f"path {path!r} climbs out of the folder; nothing was fetched")
-    if PurePosixPath(path).suffix.lower() in PICKLED:
-        raise DataError(f"file {path!r} may be pickled, and loading it can run code; refused")
-
-
-def _refuse_pickle(name: str, path: Path) -> None:
-    """Raise DataError for a file that is pickled by its name or its first bytes."""
-    _refuse_path(name)
-    with path.open("rb") as file:
-        head = file.read(4)
-    # A pickle of protocol 2 and up, or the zip in which PyTorch wraps one.
-    if (len(head) >= 2 and head[0] == 0x80 and 2 <= head[1] <= 5) or head == b"PK\x03\x04":
-        raise DataError(f"file {name!r} is pickled, and loading it can run code; refused")
-
-
-def _verify(path: Path, entry: Any) -> None:
-    """Compare a file with the checksum of its entry: SHA-256 of LFS, git's SHA-1 of others."""
-    _refuse_pickle(entry.path, path)
-    if entry.lfs:
-        expected, digest = entry.lfs.sha256, hashlib.sha256()
-    else:
-        expected, digest = entry.blob_id, hashlib.sha1(b"blob %d\0" % path.stat().st_size)
-    with path.open("rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    if digest.hexdigest() != expected:
-        raise DataError(f"file {entry.path!r} does not have the checksum that the Hub states")
-
-
 @contextmanager
 def _one_line_errors(what: str) -> Iterator[None]:
     """Turn what the client and the network raise into a DataError of one line."""
     import httpx
+    from huggingface_hub import constants
     from huggingface_hub.errors import (
         EntryNotFoundError,
         HfHubHTTPError,
@@ -296,6 +258,10 @@ def _one_line_errors(what: str) -> Iterator[None]:
         raise DataError(f"{what}: the Hub refused ({one_line(error)})") from None
     except OfflineModeIsEnabled:
         raise DataError(f"{what}: HF_HUB_OFFLINE is set; unset it to reach a Hub") from None
+    except httpx.ConnectError as error:
+        raise DataError(
+            f"{what}: cannot reach {constants.ENDPOINT} ({one_line(error)}); run it again to go on"
+        ) from None
     except (httpx.HTTPError, HFValidationError, OSError, RuntimeError, ValueError) as error:
         cause = error.__cause__ or error
         raise DataError(f"{what}: failed ({one_line(cause)}); run it again to go on") from None

@@ -160,9 +160,11 @@ def test_recordings_go_to_a_repository_of_their_own_if_they_are_whole(server, tm
 def test_a_policy_comes_back_and_one_that_is_pickled_does_not_go(server, tmp_path):
     policy = tmp_path / "pretrained_model"
     policy.mkdir()
-    (policy / "config.json").write_text("{}")
+    (policy / "config.json").write_text('{"agent": {"task": "stack"}}')
     (policy / "model.safetensors").write_bytes(bytes(50))
-    hub.push(hub.plan_push(policy, "lab/policy"))
+    hub.push(hub.plan_push(policy, "lab/policy", "mit"))
+    card = server.files("model", "lab/policy")["README.md"].decode()
+    assert "license: mit" in card and "- stack" in card and "@misc{eisp" in card
     hub.pull("lab/policy", tmp_path / "back", repo_type="model")
     assert (tmp_path / "back/model.safetensors").read_bytes() == bytes(50)
     (policy / "notes.dat").write_bytes(pickle.dumps({"a": 1}))
@@ -219,6 +221,13 @@ class TestPullLeavesNothingBehind:
         (tmp_path / "back").mkdir()
         with pytest.raises(DataError, match="exists already"):
             hub.pull(REPO, tmp_path / "back")
+
+
+def test_a_hub_that_does_not_answer_is_named(server, monkeypatch, tmp_path):
+    monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", "http://127.0.0.1:9")
+    with pytest.raises(DataError, match=r"cannot reach http://127.0.0.1:9 \(") as caught:
+        hub.pull(REPO, tmp_path / "back")
+    assert "\n" not in str(caught.value) and not (tmp_path / "back").exists()
 
 
 def test_a_wrong_token_and_a_wrong_name_are_one_line_each(make_dataset, server, monkeypatch):
