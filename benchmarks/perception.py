@@ -23,7 +23,9 @@ import tyro
 from eisp_data.policies.registry import SCRIPTS
 from eisp_data.policies.script import Noise, ScriptedPolicy
 from eisp_data.robots.motion import CartesianServo
+from eisp_data.robots.mover import Mover
 from eisp_data.robots.robot import CameraFrame
+from eisp_data.robots.safe_robot import SafeRobot
 from eisp_data.robots.tracker import Tracker
 from eisp_data.robots.twin.camera import CAMERA
 from eisp_data.robots.twin.robot import TwinRobot
@@ -121,13 +123,19 @@ def scripted(
     robot, referee = watcher.robot, watcher.robot.referee
     goal = referee.reset(seed)
     servo = CartesianServo(
-        robot.arm, robot.control_hz, robot.calibration.transform_task_to_base, options.speed
+        robot.arm,
+        robot.control_hz,
+        robot.calibration.transform_task_to_base,
+        options.speed,
+        robot.task.fingers_closed,
     )
-    servo.start()
+    safe = SafeRobot(robot)
+    safe.connect()
+    mover = Mover(safe, servo)
+    mover.start()
     robot.wait_until(_WARM_UP_S)
     policy = ScriptedPolicy(robot.task, SCRIPTS[task], Noise(), 1)
     policy.begin(0, referee.state()[None], goal, seed)
-    sent = robot.observe().joint_position
     dark_until_s, was_held = 0.0, False
     for _ in range(options.most_steps):
         now = robot.now_s()
@@ -139,8 +147,7 @@ def scripted(
         yield from samples
         if policy.finished[0]:
             break
-        command = servo.step(policy.act(referee.state()[None])[0], sent)
-        sent = robot.command(command).joint_position
+        mover.send(policy.act(referee.state()[None])[0], safe.observe())
         robot.wait_until(now + 1 / robot.control_hz)
     print(
         f"  {task}, seed {seed}: {'solved' if referee.success(goal) else 'not solved'}", flush=True

@@ -14,8 +14,12 @@ _SHORTEST_STEPS = 10
 """A subgoal that is reached sooner, because it was all but reached before, is worth no look."""
 _CLINGING_STEPS = 25
 """What is at its goal and has been held there for so long is let go of."""
-_OFF_STEPS = 3
-"""Hands are off once they have been for so many steps."""
+_SURPRISE_M = 0.01
+"""A look that shows an object this far from where it was believed to be calls for a new plan."""
+_CLEAR_M = 0.05
+"""An arm that is this far from all objects is in the middle of no push and no pull."""
+_DONE_STEPS = 3
+"""It has done with them once that has been so for so many steps."""
 
 
 class PolicyController:
@@ -53,34 +57,45 @@ class PolicyController:
 
 
 class Looking:
-    """Asks for a look at the table after each subgoal, once the fingers have let go.
+    """Asks for a look at the table after each subgoal, once the arm has let go and come away.
 
-    Then the policy plans anew from what was seen.
+    Where the look shows something else than was believed, the policy plans anew.
     """
 
     def __init__(self, inner: PolicyController, task: Task) -> None:
         self.name = inner.name
         self._inner, self._task = inner, task
-        self._off = self._since = self._clung = 0
+        self._done = self._since = self._clung = 0
         self._due, self._goal = False, np.empty(0)
+        self._believed: np.ndarray | None = None
 
     def begin(self, seen: Seen, goal: np.ndarray, seed: int) -> None:
         """Start an episode."""
-        self._due, self._goal = False, goal
-        self._off = self._since = self._clung = 0
+        self._due, self._goal, self._believed = False, goal, None
+        self._done = self._since = self._clung = 0
         self._inner.begin(seen, goal, seed)
 
     def act(self, seen: Seen) -> Decision:
         """Return the policy's action, or that it is time for a look."""
+        if self._believed is not None:
+            if np.abs(seen.achieved_goal - self._believed).max() > _SURPRISE_M:
+                self._inner.replan()
+            self._believed = None
         decision = self._inner.act(seen)
         self._since += 1
         self._due |= self._inner.at_subgoal and self._since >= _SHORTEST_STEPS
-        hands_off = self._task.fingers_closed or bool(self._task.hands_off(seen.state[None])[0])
-        self._off = self._off + 1 if hands_off else 0
+        state = seen.state[None]
+        hands_off = self._task.fingers_closed or bool(self._task.hands_off(state)[0])
+        away = np.linalg.norm(seen.achieved_goal.reshape(-1, 3) - seen.gripper_m, axis=1)
+        done = bool(self._task.settled(state)[0]) and away.min() > _CLEAR_M
+        self._done = self._done + 1 if done else 0
         met = bool(is_success(seen.achieved_goal, self._goal))
         self._clung = self._clung + 1 if met and not hands_off else 0
-        if self._clung < _CLINGING_STEPS and not (self._due and self._off >= _OFF_STEPS):
+        clings = self._clung >= _CLINGING_STEPS
+        if not clings and not (self._due and self._done >= _DONE_STEPS):
             return decision
+        if clings:
+            self._inner.replan()
         self._due, self._since, self._clung = False, 0, 0
-        self._inner.replan()
+        self._believed = seen.achieved_goal.copy()
         return Decision(np.zeros(4), looking=True)

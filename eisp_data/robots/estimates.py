@@ -58,7 +58,7 @@ def state_from_estimates(task: Task, estimates: Estimates) -> np.ndarray:
         block = _seen(estimates, f"block{index}")
         rotation = upright(block.transform_object_to_task[:3, :3])
         qpos[place : place + 3] = block.transform_object_to_task[:3, 3]
-        qpos[place + 3 : place + 7] = _quaternion(rotation)
+        qpos[place + 3 : place + 7] = quaternion(rotation)
         qvel[speed : speed + 3] = block.velocity
         # MuJoCo has the angular velocity in the frame of the body.
         qvel[speed + 3 : speed + 6] = rotation.T @ block.spin
@@ -86,7 +86,7 @@ def _seen(estimates: Estimates, name: str) -> ObjectEstimate:
     return estimates.objects[name]
 
 
-def _quaternion(rotation: np.ndarray) -> np.ndarray:
+def quaternion(rotation: np.ndarray) -> np.ndarray:
     """Return the (4,) quaternion wxyz of a (3, 3) rotation."""
     import mujoco
 

@@ -69,10 +69,6 @@ class Kinematics:
         at_tool = self._joint_to_tool.toActionMatrix() @ local
         return np.concatenate([rotation @ at_tool[:3], rotation @ at_tool[3:]])
 
-    def manipulability(self, joint_position: np.ndarray) -> float:
-        """Return the smallest singular value of the Jacobian: 0 at a singularity."""
-        return float(np.linalg.svd(self.jacobian(joint_position), compute_uv=False)[-1])
-
     def random_postures(self, rng: np.random.Generator, count: int) -> np.ndarray:
         """Draw (count, J) rad uniformly within the limits; of whole turns, one."""
         low = np.where(self._turns, np.maximum(self.low, -np.pi), self.low)

@@ -26,6 +26,7 @@ _NEAR_M = 0.02
 _LONGEST_LEG_TICKS = 80
 _LONGEST_WAIT_TICKS = 75
 _OPEN_M = 0.06
+_LONGEST_OPENING_TICKS = 25
 
 
 def opening_action(opening_m: float) -> float:
@@ -36,12 +37,18 @@ def opening_action(opening_m: float) -> float:
 class Look:
     """Leads the gripper up, out of the camera's way and, once all is seen, back over the table."""
 
-    def __init__(self, gripper_m: np.ndarray, lets_go: bool) -> None:
-        """Begin at (3,) m in the task's frame; ``lets_go`` opens the fingers before anything."""
+    def __init__(self, gripper_m: np.ndarray, opens: bool, holds: bool) -> None:
+        """Begin.
+
+        Args:
+            gripper_m: (3,) m, task's frame.
+            opens: the fingers are to be open at the end; if not they stay as they are.
+            holds: there is something between them, which is let go of before anything.
+        """
         x, y, z = gripper_m
         up = np.array([x, y, max(z + _UP_M, LOOK_FROM_M[2])])
         self._legs = [up, np.array(LOOK_FROM_M), np.array(_READY_M)]
-        self._lets_go = lets_go
+        self._opens, self._holds = opens, holds
         self._ticks = 0
         """Of this leg."""
 
@@ -54,9 +61,12 @@ class Look:
             sees_all: everything on the table is in sight.
         """
         self._ticks += 1
-        fingers = 1.0 if self._lets_go else opening_action(opening_m)
-        if self._lets_go and opening_m < _OPEN_M and self._ticks < _LONGEST_LEG_TICKS:
-            return np.array([0.0, 0.0, 0.0, fingers])
+        if self._holds and opening_m < _OPEN_M and self._ticks < _LONGEST_OPENING_TICKS:
+            return np.array([0.0, 0.0, 0.0, 1.0])
+        # Fingers that open beside a block would push it away.
+        rises = len(self._legs) == 3
+        opens = self._holds or (self._opens and not rises)
+        fingers = 1.0 if opens else opening_action(opening_m)
         way = self._legs[0] - gripper_m
         # What keeps the arm from getting there shall not keep it for ever.
         there = np.linalg.norm(way) < _NEAR_M or self._ticks > _LONGEST_LEG_TICKS

@@ -28,7 +28,11 @@ _SHARE = 0.8
 
 
 class CartesianServo:
-    """Turns the policies' actions into joint targets, the fingers pointing down all the while."""
+    """Turns the policies' actions into joint targets, the fingers pointing down all the while.
+
+    Attributes:
+        fingers_closed: whether the gripper stays closed whatever the actions say.
+    """
 
     def __init__(
         self,
@@ -36,6 +40,7 @@ class CartesianServo:
         control_hz: float,
         transform_task_to_base: np.ndarray | None = None,
         speed: float = 1.0,
+        fingers_closed: bool = False,
     ) -> None:
         """Prepare; call ``start`` first.
 
@@ -44,11 +49,13 @@ class CartesianServo:
             control_hz: how often ``step`` is called.
             transform_task_to_base: (4, 4), the arm's usual one if left out.
             speed: share of the speed that the policies were trained with.
+            fingers_closed: the gripper stays closed whatever the action says, as in ``Task``.
         """
         placed = transform_task_to_base
         self._placed = get_arm(arm).transform_task_to_base if placed is None else placed
         self._kinematics = Kinematics(arm)
         self._period_s, self._speed = 1.0 / control_hz, speed
+        self.fingers_closed = fingers_closed
         self._here: np.ndarray | None = None
 
     def tool_in_task(self, joint_position: np.ndarray) -> np.ndarray:
@@ -84,8 +91,21 @@ class CartesianServo:
         self._here = here
         # What is not a number stays one: the filter then leaves the gripper as it is.
         opening = float(np.clip((action[3] + 1.0) / 2.0, 0.0, 1.0)) * _OPEN_M
+        if self.fingers_closed:
+            opening = 0.0
         joints = self._kinematics.track(fingers_down(target, self._placed), sent)
         return JointCommand(joints, opening)
+
+    def give_way(self, joint_position: np.ndarray) -> np.ndarray:
+        """Return the targets (J,) rad that leave an arm where it was pressed to, at (J,) rad.
+
+        Where that is outside of the workspace it is brought back: a filter would not let it stay.
+        """
+        here = self.tool_in_task(joint_position)
+        inside = np.clip(here, WORKSPACE_LOW_M, WORKSPACE_HIGH_M)
+        if np.array_equal(here, inside):
+            return joint_position
+        return self._kinematics.track(fingers_down(inside, self._placed), joint_position)
 
 
 def joint_path(

@@ -11,6 +11,7 @@ from eisp_data.errors import RobotError
 from eisp_data.robots.look import FRESH_S, Look
 from eisp_data.robots.loop import Ticks
 from eisp_data.robots.motion import CartesianServo
+from eisp_data.robots.mover import Mover
 from eisp_data.robots.record_controllers import Controller, Decision
 from eisp_data.robots.robot import JointCommand, Robot
 from eisp_data.robots.session_log import SessionLog
@@ -23,8 +24,6 @@ _MET_TICKS = 12
 """An episode is a success once its goal has been met for half a second."""
 _STAND_TICKS = 8
 """What is wrong with the first images is said before the arm moves."""
-_YIELD_SHARE = 0.6
-"""Of a joint's greatest torque. In training 60 N was the most that the gripper could push with."""
 
 Watch = Callable[[int, Seen, Decision], None]
 
@@ -66,13 +65,10 @@ class Session:
         log: SessionLog,
         servo: CartesianServo,
         stop: StopSignal,
-        fingers_closed: bool,
     ) -> None:
-        """Take a connected robot with a safety filter; ``fingers_closed`` as in the task."""
-        self._fingers_closed = fingers_closed
+        """Take a connected robot with a safety filter."""
         self._robot, self._log, self._stop = robot, log, stop
-        self._servo = servo
-        self._sent: np.ndarray | None = None
+        self._mover = Mover(robot, servo)
         self._since_s = 0.0
         self.ticks = Ticks(robot, robot.control_hz)
         self.doing = "standing"
@@ -105,7 +101,8 @@ class Session:
             RobotError: the robot or a camera does not answer, or something cannot be seen.
         """
         self._eyes, self._goal, self._subgoal = eyes, goal, None
-        self._look = self._sent = None
+        self._look = None
+        self._mover.start()
         self._subgoals, self._by_human = 0, False
         # The table may have been set anew: an image from before shows another one.
         self._since_s = self._robot.now_s()
@@ -140,7 +137,7 @@ class Session:
             if decision.outcome:
                 return self._ended(decision.outcome, step, seen)
             self._note(decision, seen, step, at_ns)
-            command = self._send(decision.action)
+            command = self._mover.send(decision.action, self._log.reading)
             self._record_sent(decision, command, at_ns)
             watch(step, seen, decision)
         raise AssertionError("ticks never end")
@@ -160,13 +157,13 @@ class Session:
             self.doing = f"looking for {', '.join(missing)}" if missing else "looking"
             if number < _STAND_TICKS:
                 continue
-            here = self._servo.tool_in_task(reading.joint_position)
-            look = look or Look(here, lets_go=False)
+            here = self._mover.servo.tool_in_task(reading.joint_position)
+            look = look or Look(here, opens=False, holds=False)
             in_sight = not missing and self._eyes.see(at_ns / 1e9, reading).age_s < FRESH_S
             action = look.step(here, reading.gripper_opening_m, in_sight)
             if action is None:
                 break
-            self._log.sent(self._send(action), at_ns)
+            self._log.sent(self._mover.send(action, reading), at_ns)
         if missing:
             raise RobotError(f"the camera does not see {', '.join(missing)}")
         return True
@@ -177,30 +174,14 @@ class Session:
             decision = controller.act(seen)
             if not decision.looking:
                 return decision
-            self._look = Look(seen.gripper_m, lets_go=not self._fingers_closed)
+            holds = any(thing.held for thing in seen.estimates.objects.values())
+            self._look = Look(seen.gripper_m, opens=True, holds=holds)
         opening_m = seen.estimates.tool.opening_m
         action = self._look.step(seen.gripper_m, opening_m, seen.age_s < FRESH_S)
         if action is not None:
             return Decision(action, looking=True)
         self._look = None
         return self._decide(controller, seen)
-
-    def _send(self, action: np.ndarray) -> JointCommand:
-        """Send an action; an arm that presses too hard against something gives way for a tick."""
-        if self._fingers_closed:
-            action = np.append(action[:3], -1.0)
-        reading = self._log.reading
-        if self._sent is None:
-            self._servo.start()
-            self._sent = reading.joint_position
-        wanted = self._servo.step(action, self._sent)
-        if reading.joint_effort is not None:
-            share = np.abs(reading.joint_effort) / self._robot.limits.effort
-            if share.max() > _YIELD_SHARE:
-                wanted = JointCommand(reading.joint_position, wanted.gripper_opening_m)
-        command = self._robot.command(wanted)
-        self._sent = command.joint_position
-        return command
 
     def _poll(self, part: int) -> None:
         # Right after a command there is most time until the next one.
@@ -264,6 +245,8 @@ class Session:
         if len(observation) > GRIPPER_DIM:
             log.vector("/observation/world", observation[GRIPPER_DIM:], at_ns, role=WORLD)
         log.vector("/achieved_goal", seen.achieved_goal, at_ns, role=REACHED)
+        if seen.estimates.objects:
+            log.objects(seen.estimates, at_ns)
 
     def _record_sent(self, decision: Decision, command: JointCommand, at_ns: int) -> None:
         log = self._log

@@ -82,8 +82,12 @@ class Cell:
         """Return what turns actions into joint targets."""
         from eisp_data.robots.motion import CartesianServo
 
-        placed = self.calibration.transform_task_to_base
-        return CartesianServo(self.robot.arm, self.robot.control_hz, placed)
+        return CartesianServo(
+            self.robot.arm,
+            self.robot.control_hz,
+            self.calibration.transform_task_to_base,
+            fingers_closed=self.task is not None and self.task.fingers_closed,
+        )
 
     def set_table(self, seed: int, goal: tuple[float, ...] | None) -> np.ndarray:
         """Return the goal (G,) of an episode; the twin's table is set for it as well.

@@ -14,6 +14,7 @@ topic                      message                        role in a dataset
 /observation/...           ``eisp.Vector``                state, environment
 /achieved_goal, ...        ``eisp.Vector``                achieved goal, desired goal
 /subgoal                   ``eisp.Vector``                extra
+/objects                   ``foxglove.FrameTransforms``   none: for people to look at
 /events                    ``foxglove.Event``             events
 =========================  =============================  =======================================
 """
@@ -24,11 +25,12 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from eisp_data.robots.estimates import Estimates, quaternion
 from eisp_data.robots.robot import CameraFrame, JointCommand, Reading, Robot
 from eisp_data.storage.mcap import messages
-from eisp_data.storage.mcap.writer import McapWriter, McapWriterConfig, WriterStats
+from eisp_data.storage.mcap.writer import McapWriter, WriterStats
 
-_OPENING = "gripper_opening_m"
+_OPENING, _TASK_FRAME = "gripper_opening_m", "task"
 _NANOSECONDS = 1_000_000_000
 
 
@@ -46,7 +48,6 @@ class SessionLog:
         robot: Robot,
         path: Path,
         metadata: Mapping[str, str],
-        config: McapWriterConfig | None = None,
         joints_role: str | None = None,
         images: bool = True,
     ) -> None:
@@ -56,16 +57,14 @@ class SessionLog:
             robot: connected.
             path: must not exist yet.
             metadata: describes the session.
-            config: of the writer.
             joints_role: what a dataset makes of the joints; None lets the conversion choose.
             images: whether they are recorded; if not, those that nobody asks for are not taken.
         """
         path.parent.mkdir(parents=True, exist_ok=True)
         self._robot, self._joints_role, self._images = robot, joints_role, images
-        self._writer = McapWriter(path, config, metadata)
+        self._writer = McapWriter(path, metadata=metadata)
         # Whole microseconds, or rounding would part what has one stamp.
         self._epoch_ns = (self._writer.now_ns() - self._now_ns()) // 1000 * 1000
-        self.path = path
         self.reading: Reading = robot.observe()
         self.frames: dict[str, CameraFrame] = {}
         self.lost_frames: Counter[str] = Counter()
@@ -112,26 +111,20 @@ class SessionLog:
         """Record numbers of the tick ``at_ns`` of the robot's clock."""
         self._writer.vector(topic, values, self._epoch_ns + at_ns, names, role)
 
-    def poses(
-        self,
-        poses: Mapping[str, tuple[messages.Numbers, messages.Numbers]],
-        seen_s: Mapping[str, float],
-        frame_id: str,
-    ) -> None:
-        """Record where things are: name to (position, quaternion wxyz), each as of its time."""
-        times = {name: self._stamp(at_s) for name, at_s in seen_s.items()}
-        self._writer.log(
-            "/objects", messages.transforms(poses, times, frame_id), max(times.values())
-        )
+    def objects(self, estimates: Estimates, at_ns: int) -> None:
+        """Record where things are believed to be at a tick, each with the time it was last seen."""
+        poses, times = {}, {}
+        for name, thing in estimates.objects.items():
+            pose = thing.transform_object_to_task
+            poses[name] = (pose[:3, 3], quaternion(pose[:3, :3]))
+            times[name] = self._stamp(estimates.tool.time_s - thing.age_s)
+        message = messages.transforms(poses, times, _TASK_FRAME)
+        self._writer.log("/objects", message, self._epoch_ns + at_ns)
 
     def event(self, kind: str, at_ns: int | None = None, **details: object) -> None:
         """Record an event; see ``messages.EVENT_KINDS``. It happened now, if not said otherwise."""
         at = self._now_ns() if at_ns is None else at_ns
         self._writer.event(kind, self._epoch_ns + at, **details)
-
-    def stats(self) -> WriterStats:
-        """Return how many messages were written and dropped so far."""
-        return self._writer.stats()
 
     def close(self) -> WriterStats:
         """Write what is waiting, the index and the footer; DataError if the disk refuses."""

@@ -112,13 +112,7 @@ def run_session(
         if not report.simulated:
             report.real_time = stack.enter_context(priority())
         log = stack.enter_context(_recording(cell, plan, report))
-        session = Session(
-            cell.robot,
-            log,
-            cell.servo(),
-            stop,
-            cell.task is not None and cell.task.fingers_closed,
-        )
+        session = Session(cell.robot, log, cell.servo(), stop)
         report.timing = session.ticks.timing()
         status = stack.enter_context(_status(session, report))
         session.say = status.say

@@ -101,17 +101,35 @@ def test_a_look_is_no_step_of_the_task_and_after_it_the_policy_decides_at_once()
     assert len(inner.shown) == 7
 
 
-def test_the_policy_looks_after_a_subgoal_only_once_it_has_let_go() -> None:
+def test_the_policy_looks_after_a_subgoal_once_it_has_let_go_and_come_away() -> None:
     inner = Inner()
     looking = Looking(inner, STACK)
-    held = BLOCKS_M[1]
-    looking.begin(seen_at(held, BLOCK_SIZE_M), np.zeros(9), 0)
+    block, above = BLOCKS_M[1], BLOCKS_M[1] + [0.0, 0.0, 0.06]
+    held, beside = seen_at(block, BLOCK_SIZE_M), seen_at(block, 2 * FINGER_TRAVEL_M)
+    looking.begin(held, np.zeros(9), 0)
     for step in range(20):
         inner.at_subgoal = step == 12
-        assert not looking.act(seen_at(held, BLOCK_SIZE_M)).looking
-    decisions = [looking.act(seen_at(held, 2 * FINGER_TRAVEL_M)) for _ in range(6)]
+        assert not looking.act(held).looking
+    # Perhaps it is still pushing.
+    assert not any(looking.act(beside).looking for _ in range(20))
+    decisions = [looking.act(seen_at(above, 2 * FINGER_TRAVEL_M)) for _ in range(6)]
     assert [decision.looking for decision in decisions].count(True) == 1
-    assert inner.replanned == 1
+
+
+@pytest.mark.parametrize(("moved_m", "replans"), [(0.0, 0), (0.03, 1)])
+def test_the_policy_plans_anew_where_a_look_shows_something_else_than_was_believed(
+    moved_m: float, replans: int
+) -> None:
+    inner = Inner()
+    looking = Looking(inner, STACK)
+    now = seen_at(np.array([0.3, 0.0, 0.2]), 2 * FINGER_TRAVEL_M)
+    looking.begin(now, np.zeros(9), 0)
+    inner.at_subgoal = True
+    while not looking.act(now).looking:
+        assert inner.replanned == 0 and len(inner.shown) < 50
+    looking.act(replace(now, achieved_goal=now.achieved_goal + moved_m))
+    looking.act(now)
+    assert inner.replanned == replans
 
 
 def test_what_is_at_its_goal_and_held_there_is_let_go_of() -> None:

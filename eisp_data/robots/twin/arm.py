@@ -8,17 +8,11 @@ from functools import cache
 import mujoco
 import numpy as np
 
+from eisp_data.robots.arms import ARMS
 from eisp_data.robots.models import models_folder
 
-JOINTS = (
-    "shoulder_pan_joint",
-    "shoulder_lift_joint",
-    "elbow_joint",
-    "wrist_1_joint",
-    "wrist_2_joint",
-    "wrist_3_joint",
-)
-EFFORT_NM = np.array([56.0, 56.0, 28.0, 12.0, 12.0, 12.0])
+JOINTS = ARMS["ur3"].joint_names
+_EFFORT_NM = np.array(ARMS["ur3"].effort)
 """The UR3's greatest joint torques (its data sheet; the URDF has those of a UR5)."""
 
 _STIFFNESS = np.array([6000.0, 6000.0, 4000.0, 1000.0, 1000.0, 700.0])
@@ -54,7 +48,7 @@ def arm_spec() -> mujoco.MjSpec:
         servo.trntype = mujoco.mjtTrn.mjTRN_JOINT
         servo.set_to_position(kp=float(_STIFFNESS[index]), kv=float(_DAMPING[index]))
         servo.forcelimited = True
-        servo.forcerange = EFFORT_NM[index] * np.array([-1.0, 1.0])
+        servo.forcerange = _EFFORT_NM[index] * np.array([-1.0, 1.0])
     # These touch in every pose; only of a parent and its child MuJoCo knows that by itself.
     spec.add_exclude(bodyname1="base_link", bodyname2="shoulder_link")
     spec.add_exclude(bodyname1="wrist_1_link", bodyname2="wrist_3_link")

@@ -17,7 +17,7 @@ from eisp_data.errors import RobotError
 from eisp_data.robots.arms import joint_limits
 from eisp_data.robots.calibration import Calibration, designed
 from eisp_data.robots.robot import CameraFrame, JointCommand, Reading, Robot
-from eisp_data.robots.twin.arm import EFFORT_NM, JOINTS
+from eisp_data.robots.twin.arm import JOINTS
 from eisp_data.robots.twin.camera import (
     CAMERA,
     CameraOptions,
@@ -78,7 +78,6 @@ class TwinRobot(Robot):
         self.task = get_task(task)
         self.limits = replace(
             joint_limits("ur3"),
-            effort=EFFORT_NM,
             gripper_m=(0.0, 2 * FINGER_TRAVEL_M),
             gripper_speed_m_s=_GRIPPER_SPEED_M_S,
         )

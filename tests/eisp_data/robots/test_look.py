@@ -25,7 +25,7 @@ def follow(look: Look, opening_m: float, seen_from_tick: int = 0, moves: bool = 
 
 
 def test_it_rises_before_it_leaves_and_ends_over_the_table():
-    places, actions = follow(Look(START_M, lets_go=False), OPEN_M)
+    places, actions = follow(Look(START_M, opens=False, holds=False), OPEN_M)
     low = places[:, 2] < LOOK_FROM_M[2] - 0.03
     beside = np.linalg.norm(places[:, :2] - START_M[:2], axis=1) > 0.01
     last_from = np.linalg.norm(places - LOOK_FROM_M, axis=1).argmin()
@@ -36,21 +36,32 @@ def test_it_rises_before_it_leaves_and_ends_over_the_table():
 
 
 def test_it_waits_where_it_sees_all_until_it_does_but_not_for_ever():
-    at_once = len(follow(Look(START_M, lets_go=False), OPEN_M)[1])
-    later = len(follow(Look(START_M, lets_go=False), OPEN_M, seen_from_tick=at_once + 10)[1])
-    never = len(follow(Look(START_M, lets_go=False), OPEN_M, seen_from_tick=10_000)[1])
+    at_once = len(follow(Look(START_M, opens=False, holds=False), OPEN_M)[1])
+    later = len(
+        follow(Look(START_M, opens=False, holds=False), OPEN_M, seen_from_tick=at_once + 10)[1]
+    )
+    never = len(follow(Look(START_M, opens=False, holds=False), OPEN_M, seen_from_tick=10_000)[1])
     assert at_once < later < never < at_once + 200
 
 
-def test_fingers_stay_as_they_are_or_open_before_anything_moves():
-    _, actions = follow(Look(START_M, lets_go=False), 0.02)
+def test_fingers_stay_as_they_are_or_open_once_the_arm_has_risen():
+    _, actions = follow(Look(START_M, opens=False, holds=False), 0.02)
     np.testing.assert_allclose(actions[:, 3], -0.5)
-    _, actions = follow(Look(START_M, lets_go=True), 0.05, moves=False)
+    places, actions = follow(Look(START_M, opens=True, holds=False), 0.02)
+    low = places[:-1, 2] < LOOK_FROM_M[2] - 0.03
+    until = np.linalg.norm(places - LOOK_FROM_M, axis=1).argmin()
+    np.testing.assert_allclose(actions[:until][low[:until], 3], -0.5)
+    np.testing.assert_allclose(actions[until:, 3], 1.0)
+
+
+def test_what_is_held_is_let_go_of_before_anything_moves():
+    _, actions = follow(Look(START_M, opens=True, holds=True), 0.05)
     assert (actions[:10] == [0.0, 0.0, 0.0, 1.0]).all()
-    _, actions = follow(Look(START_M, lets_go=True), OPEN_M)
-    assert actions[0, 2] > 0 and (actions[:, 3] == 1.0).all()
+    assert actions[:, 2].max() > 0 and (actions[:, 3] == 1.0).all()
+    _, actions = follow(Look(START_M, opens=True, holds=True), OPEN_M)
+    assert actions[0, 2] > 0
 
 
 def test_an_arm_that_cannot_move_ends_its_look_all_the_same():
-    _, actions = follow(Look(START_M, lets_go=True), OPEN_M, moves=False)
+    _, actions = follow(Look(START_M, opens=True, holds=True), OPEN_M, moves=False)
     assert len(actions) < 300

@@ -68,6 +68,17 @@ def test_the_fourth_action_opens_and_closes_the_gripper():
     servo = CartesianServo("ur3", HZ)
     openings = [servo.step(np.array([0, 0, 0, a]), posture).gripper_opening_m for a in (-9, 0, 9)]
     np.testing.assert_allclose(openings, [0.0, FINGER_TRAVEL_M, 2 * FINGER_TRAVEL_M])
+    pushing = CartesianServo("ur3", HZ, fingers_closed=True)
+    assert pushing.step(np.ones(4), posture).gripper_opening_m == 0.0
+
+
+def test_an_arm_gives_way_to_where_it_was_pressed_but_not_out_of_the_workspace():
+    _, inside = start_at("ur3", (0.30, 0.0, 0.15))
+    _, outside = start_at("ur3", (0.30, 0.23, 0.15))
+    servo = CartesianServo("ur3", HZ)
+    np.testing.assert_array_equal(servo.give_way(inside), inside)
+    place = servo.tool_in_task(servo.give_way(outside))
+    np.testing.assert_allclose(place, [0.30, WORKSPACE_HIGH_M[1], 0.15], atol=1e-4)
 
 
 def test_half_the_speed_is_half_the_way():

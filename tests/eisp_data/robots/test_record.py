@@ -220,6 +220,8 @@ def test_a_script_on_the_twin_becomes_a_dataset_in_the_layout_of_its_task(
     watched = RecordConfig(output=tmp_path / "b.mcap", watch="gamepad", **options)
     record(watched)
     convert(ConvertConfig(inputs=(tmp_path / "a.mcap", watched.output), to=tmp_path / "data"))
+    with McapLog(tmp_path / "a.mcap") as log:
+        assert log.stats()["/objects"].count == log.stats()["/achieved_goal"].count == 11
     alone, helped = read_episodes(tmp_path / "data")
     for episode in (alone, helped):
         assert episode.observation.shape == (11, 55) and episode.action.shape == (10, 4)

@@ -240,13 +240,13 @@ def test_on_the_walls_time_images_keep_coming_and_the_clock_runs_by_itself():
         start = robot.now_s()
         robot.wait_until(start + 0.1)
         assert robot.now_s() >= start + 0.1
-        for _ in range(200):
+        frame = None
+        while robot.now_s() < start + 120 and (frame is None or frame.sequence < 2):
             robot.wait_until(robot.now_s() + 0.02)
             frame = robot.frames().get(CAMERA)
-            if frame is not None and frame.sequence >= 2:
-                break
         assert frame is not None and frame.captured_s <= robot.now_s()
-        assert robot.observe().hardware_s == pytest.approx(robot.now_s(), abs=0.5)
+        # Up to a step of the simulation; how far behind depends on the machine's load.
+        assert start < robot.observe().hardware_s <= robot.now_s() + 0.01
 
 
 def test_an_external_hand_moves_a_block():
