@@ -96,6 +96,8 @@ def decode_video(
     try:
         with av.open(str(path)) as container:
             stream = container.streams.video[0]
+            if stream.codec_context is None:  # to decode it would end the process
+                raise ValueError("unknown codec")
             # Starting threads costs more than decoding a few small frames.
             stream.thread_type = "AUTO" if stop - start > 200 else "NONE"
             base = stream.time_base or Fraction(1, fps)

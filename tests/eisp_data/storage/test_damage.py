@@ -23,7 +23,7 @@ from eisp_data.storage.lerobot import DatasetWriter, read_episodes
 from eisp_data.storage.preview import preview_png
 from eisp_data.storage.repair import repair
 from eisp_data.storage.validate import validate
-from eisp_data.storage.video import encode_video
+from eisp_data.storage.video import decode_video, encode_video
 
 MUTATIONS = int(os.environ.get("EISP_MUTATIONS", "40"))
 MEMORY_BYTES = 700 * 2**20
@@ -126,6 +126,15 @@ class TestEachKindOfDamage:
         for attempt in (lambda: list(read_episodes(root, images=True)), lambda: preview_png(root)):
             with pytest.raises(DataError, match="is 32 x 64 pixels, not 48 x 48"):
                 attempt()
+        assert repair(root).episodes == 2
+
+    def test_a_video_of_a_codec_that_nobody_knows(self, make_dataset):
+        root, _ = make_dataset(cameras=True)
+        path = root / "videos/observation.images.top/chunk-000/file-001.mp4"
+        path.write_bytes(path.read_bytes().replace(b"avc1", b"zzzz"))
+        with pytest.raises(DataError, match="frame 0 cannot be decoded"):
+            list(decode_video(path, 0, 1, 25, (48, 48)))
+        assert {"video frames", "video ends"} <= failed(root)
         assert repair(root).episodes == 2
 
     def test_bits_of_one_row_group_cost_one_episode(self, make_dataset):
