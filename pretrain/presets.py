@@ -53,6 +53,8 @@ def image_preset(
 
 _FOREIGN_WAYPOINTS = 4
 """The paper's n of Stack and Push4 (Table I)."""
+_BETA = 100.0
+"""Weight of L_HS where the divergence of many components would leave nothing of it."""
 
 
 def _cpu(task: str, root: Path, output_dir: Path) -> PretrainConfig:
@@ -68,6 +70,8 @@ def _cpu(task: str, root: Path, output_dir: Path) -> PretrainConfig:
             # In an environment of which nothing is known, nothing may ever come to rest.
             waypoints=None if known else _FOREIGN_WAYPOINTS,
             sac=SacConfig(lr=1e-3, gamma=0.98),
+            # With the paper's beta its generator says the same of every state: see docs/method.md.
+            hybrid=HybridConfig() if known else HybridConfig(beta=_BETA),
             # Each of n objects may be off by a share of the task's tolerance.
             mix=GoalMix(tolerance_m=SUCCESS_DISTANCE_M / objects**0.5),
         ),
@@ -129,7 +133,7 @@ def _cpu_image(config: PretrainConfig) -> PretrainConfig:
             # In an image something moves at all times: the gripper.
             waypoints=table.waypoints,
             # Beside the divergence of 108 components the paper's beta leaves nothing of L_HS.
-            hybrid=HybridConfig(beta=_IMAGE_BETA),
+            hybrid=HybridConfig(beta=_BETA),
             subgoals=SubgoalConfig(
                 candidates=1, every_steps=_IMAGE_SUBGOAL_STEPS, reached_m=SUCCESS_DISTANCE_M
             ),
@@ -139,7 +143,6 @@ def _cpu_image(config: PretrainConfig) -> PretrainConfig:
     )
 
 
-_IMAGE_BETA = 100.0
 _IMAGE_SUBGOAL_STEPS = 20
 """About as far apart as the waypoints of a demonstration."""
 _PAPER_IMAGE_GENERATOR_LR = 3e-5
