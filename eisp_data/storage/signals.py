@@ -21,10 +21,10 @@ CLEAR_CORRELATION = 0.3
 COMMANDED = ("observation.state", "action")
 """Columns that move in every episode."""
 MEASURED = ("observation.state", "observation.environment_state", "observation.achieved_goal")
-FAR_WIDTHS = 20
+FAR_WIDTHS = 100
 """A value is far out if it is this many widths of its usual range beyond that range."""
-LEAST_WIDTH = 1e-2
-"""The least that counts as the width of a range: 1 cm where it is a length."""
+LEAST_WIDTH = 0.1
+"""The least that counts as the width of a range, so that no turn of a quaternion is far out."""
 
 
 class Collected:

@@ -214,7 +214,7 @@ def test_a_stuck_channel_and_a_late_action_are_pointed_out(tmp_path):
 def test_an_object_that_fell_off_the_table_is_pointed_out(tmp_path):
     spec = spec_of()
     episodes = [random_episode(spec, 30, seed) for seed in range(5)]
-    episodes[3].achieved_goal[:, 2] -= 300 * np.linspace(0, 1, 31, dtype=np.float32) ** 2
+    episodes[3].achieved_goal[:, 2] -= 3000 * np.linspace(0, 1, 31, dtype=np.float32) ** 2
     with DatasetWriter(tmp_path / "d", spec, {}) as writer:
         writer.write(episodes)
     warned = {check.name: check.detail for check in validate(tmp_path / "d") if check.warning}
