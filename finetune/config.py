@@ -24,15 +24,17 @@ class OnlineConfig:
     pursued: float = 0.5
     """Share of the other goals that are the subgoals that were pursued, met or not: where the
     policy fails is learned from these alone."""
-    lr: float = 1.5e-4
-    """Of SAC at the start; near the one that pretraining ends with, or what it settled is stirred
-    up again. It falls linearly to a tenth."""
+    noise: float = 0.5
+    """Share of the policy's noise that its actions have: with all of it a good policy fails often
+    enough to unlearn what it could."""
+    lr: float = 5e-5
+    """Of SAC at the start: less than pretraining ends with, or what it settled is stirred up
+    again. It falls linearly to a tenth."""
     cloning: float = 20.0
     """Weight of cloning the actions that led to the goal."""
-    generator_every: int | None = None
-    """Updates of SAC for one of the generator; 0 leaves it as it is. Left out, it is 4 where
-    learning starts from nothing and 0 after pretraining: the pieces of a rollout are too short to
-    show what a far goal needs first."""
+    generator_every: int = 4
+    """Updates of SAC for one of the generator, which learns from old and new data by their
+    amounts; 0 leaves it as it is."""
     generator_batch_size: int = 256
     generator_lr: float = 3e-4
     """At the start; it falls with the other."""

@@ -50,9 +50,7 @@ class PolicyController:
         achieved = seen.achieved_goal[None]
         self.at_subgoal = self._begun and bool(self._rollout.reached(achieved)[0])
         self._begun = True
-        action = self._rollout.act(
-            seen.observation[None], achieved, self._goal[None], explore=False
-        )[0]
+        action = self._rollout.act(seen.observation[None], achieved, self._goal[None])[0]
         return Decision(action.astype(float), subgoal=self._rollout.subgoal[0].copy())
 
 

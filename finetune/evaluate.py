@@ -139,9 +139,7 @@ def _batch(
     returns = np.zeros(worlds.count)
     some = worlds.success
     for _ in range(worlds.episode_steps):
-        action = policy.act(
-            worlds.observation, worlds.achieved_goal, worlds.desired_goal, explore=False
-        )
+        action = policy.act(worlds.observation, worlds.achieved_goal, worlds.desired_goal)
         worlds.step(action)
         returns += worlds.success - 1.0
         some |= worlds.success

@@ -16,6 +16,8 @@ class SubgoalPolicy:
     Attributes:
         subgoal: (N, G) float32, what each world is heading for.
         age: (N,) int64, steps for which it has been.
+        start: (N, G) float32, where all was when it was chosen.
+        stuck: (N,) bool, whether for the sake of the one before it nothing moved.
     """
 
     def __init__(self, agent: Agent, worlds: int, device: str = "cpu") -> None:
@@ -23,13 +25,13 @@ class SubgoalPolicy:
         self._config = agent.config.subgoals
         self.subgoal = np.zeros((worlds, agent.layout.goal_dim), np.float32)
         self.age = np.full(worlds, self._config.every_steps)
-        self._start = np.full_like(self.subgoal, np.inf)
-        self._stuck = np.zeros(worlds, bool)
+        self.start = np.full_like(self.subgoal, np.inf)
+        self.stuck = np.zeros(worlds, bool)
 
     def reset(self, worlds: np.ndarray) -> None:
         """Forget the subgoals of the named worlds."""
         self.age[worlds] = self._config.every_steps
-        self._start[worlds] = np.inf
+        self.start[worlds] = np.inf
 
     def reached(self, achieved_goal: np.ndarray) -> np.ndarray:
         """Return whether each world is at its subgoal, (N,) bool, of (N, G) achieved goals."""
@@ -41,8 +43,7 @@ class SubgoalPolicy:
         observation: np.ndarray,
         achieved_goal: np.ndarray,
         desired_goal: np.ndarray,
-        *,
-        explore: bool,
+        noise: float = 0.0,
     ) -> np.ndarray:
         """Renew the subgoals that are reached or too old, and return actions towards them.
 
@@ -50,7 +51,7 @@ class SubgoalPolicy:
             observation: (N, S).
             achieved_goal: (N, G).
             desired_goal: (N, G).
-            explore: sample actions instead of taking their mean.
+            noise: how much of the policy's own noise its actions have, see ``Sac.act``.
 
         Returns:
             (N, A) float32 in [-1, 1].
@@ -66,15 +67,15 @@ class SubgoalPolicy:
             self.subgoal[renew] = np.where(near[:, None], desired_goal[renew], chosen)
             self.age[renew] = 0
         self.age += 1
-        action = self._act(observation, self.subgoal, explore)
-        stuck = np.flatnonzero(self._stuck)
-        if len(stuck) and not explore:
-            action[stuck] = self._act(observation[stuck], self.subgoal[stuck], True)
+        action = self._act(observation, self.subgoal, noise)
+        stuck = np.flatnonzero(self.stuck)
+        if len(stuck) and noise < 1:
+            action[stuck] = self._act(observation[stuck], self.subgoal[stuck], 1.0)
         return action
 
-    def _act(self, observation: np.ndarray, subgoal: np.ndarray, explore: bool) -> np.ndarray:
+    def _act(self, observation: np.ndarray, subgoal: np.ndarray, noise: float) -> np.ndarray:
         seen, target = self._tensor(observation), self._tensor(subgoal)
-        return self._agent.sac.act(seen, target, explore=explore).cpu().numpy()
+        return self._agent.sac.act(seen, target, noise).cpu().numpy()
 
     def _notice_stuck(
         self, renew: np.ndarray, reached: np.ndarray, achieved_goal: np.ndarray
@@ -84,10 +85,10 @@ class SubgoalPolicy:
         A policy without noise that has come to a standstill stays there. Its own noise frees it:
         until the next subgoal its actions are sampled.
         """
-        way = np.abs(achieved_goal[renew] - self._start[renew]).max(axis=1)
+        way = np.abs(achieved_goal[renew] - self.start[renew]).max(axis=1)
         still = way < self._config.reached_m / 2
-        self._stuck[renew] = still & ~reached[renew] & self._config.sample_when_stuck
-        self._start[renew] = achieved_goal[renew]
+        self.stuck[renew] = still & ~reached[renew] & self._config.sample_when_stuck
+        self.start[renew] = achieved_goal[renew]
 
     def _choose(
         self,

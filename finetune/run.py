@@ -35,8 +35,6 @@ from vqvae.worlds import ImageWorlds
 
 _FIRST_EPISODES = 100
 """Episodes of random actions before learning from nothing."""
-_GENERATOR_EVERY = 4
-"""Updates of SAC for one of a generator that learns from nothing."""
 
 
 def finetune(config: FinetuneConfig) -> dict[str, float]:
@@ -47,13 +45,10 @@ def finetune(config: FinetuneConfig) -> dict[str, float]:
     device = set_up(config.device, threads_of_half(config.threads))
     print(describe(device, config.threads), flush=True)
     torch.manual_seed(config.seed)
-    online = config.online
     if config.policy.path is None:
         if config.env.id is None:
             raise ConfigError("give --policy.path, a pretrained policy, or --env.id to start anew")
         agent, data = _from_nothing(config.env.id, config.seed)
-        if online.generator_every is None:
-            online = replace(online, generator_every=_GENERATOR_EVERY)
     else:
         agent = Agent.load(find_policy(config.policy.path))
         data = _dataset(config, agent)
@@ -68,7 +63,7 @@ def finetune(config: FinetuneConfig) -> dict[str, float]:
         agent.to(device),
         data,
         lambda count: make_worlds(agent, count),
-        online,
+        config.online,
         config.seed,
         device,
         config.threads,
@@ -83,7 +78,7 @@ def finetune(config: FinetuneConfig) -> dict[str, float]:
 
 def _check(config: FinetuneConfig) -> None:
     online = config.online
-    at_least(0, {"--seed": config.seed, "--online.generator-every": online.generator_every or 0})
+    at_least(0, {"--seed": config.seed, "--online.generator-every": online.generator_every})
     at_least(
         1,
         {
@@ -99,7 +94,11 @@ def _check(config: FinetuneConfig) -> None:
         },
     )
     at_least(online.round_steps + 1, {"--online.replay-size": online.replay_size})
-    for name, share in (("offline-share", online.offline_share), ("pursued", online.pursued)):
+    for name, share in (
+        ("offline-share", online.offline_share),
+        ("pursued", online.pursued),
+        ("noise", online.noise),
+    ):
         if not 0 <= share <= 1:
             raise ConfigError(f"--online.{name} must be 0 to 1; got {share}")
     check_subgoals(config.subgoals, "--subgoals")

@@ -106,7 +106,7 @@ def subgoal_strip(policy: Path, model: VqVae, seed: int) -> np.ndarray:
         torch.manual_seed(seed)
         for step in range(worlds.episode_steps):
             before = worlds.observation, worlds.achieved_goal, worlds.desired_goal
-            action = rollout.act(*before, explore=False)
+            action = rollout.act(*before)
             if step % _STRIP_STEPS == 0 and len(seen) < _PICTURES - 1:
                 seen.append(worlds.images()[0])
                 headed.append(rollout.subgoal[0].copy())

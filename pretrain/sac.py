@@ -116,10 +116,13 @@ class Sac(nn.Module):
         return -1.0 / (1.0 - self.config.gamma)
 
     @torch.no_grad()
-    def act(self, observation: Tensor, goal: Tensor, *, explore: bool) -> Tensor:
-        """Return (B, A) actions: a sample if exploring, else the mean."""
-        action, _, mean = self.actor.sample(self.features(observation, goal))
-        return action if explore else mean
+    def act(self, observation: Tensor, goal: Tensor, noise: float = 0.0) -> Tensor:
+        """Return (B, A) actions: the mean, or with noise 1 a sample, or something between."""
+        mean, log_std = self.actor(self.features(observation, goal))
+        if noise:
+            mean = mean + noise * log_std.exp() * torch.randn_like(mean)
+        action: Tensor = mean.tanh()
+        return action
 
     @torch.no_grad()
     def value(self, observation: Tensor, goal: Tensor) -> Tensor:

@@ -223,7 +223,7 @@ def rollouts(env_id: str, count: int = 3, source: str = "none") -> Rollouts:
 def test_collected_rows_are_what_happened():
     started = rollouts("PushedLine-v0")
     goals = np.repeat(started.worlds.desired_goal, 6, axis=0)
-    observation, achieved, action, pursued, starts = started.collect(5)
+    observation, achieved, action, pursued, starts = started.collect(5, 1.0)
     np.testing.assert_array_equal(pursued, goals)
     assert starts.tolist() == [0, 6, 12, 18]
     np.testing.assert_array_equal(observation, achieved)
@@ -236,7 +236,7 @@ def test_collected_rows_are_what_happened():
 
 def test_a_world_that_ends_early_leaves_no_rows_after_its_end():
     started = rollouts("ShortPushedLine-v0")
-    _, achieved, action, _, starts = started.collect(10)
+    _, achieved, action, _, starts = started.collect(10, 1.0)
     assert np.diff(starts).tolist() == [5, 5, 5]
     for first, stop in zip(starts, starts[1:], strict=False):
         moved = np.diff(achieved[first:stop, 0])
@@ -248,13 +248,13 @@ def test_worlds_start_anew_when_they_are_over_or_have_kept_a_success_for_a_round
     started = rollouts("PushedLine-v0")
     # The noise stays within 5 cm of where each began: 102 begins at its goal, 101 and 103 do not.
     started.policy._agent.sac.actor.body[-1].bias.data[1] = -5.0
-    started.collect(2)
+    started.collect(2, 1.0)
     assert started.worlds.steps.tolist() == [2, 2, 2] and started.next_seed == 104
-    started.collect(2)
+    started.collect(2, 1.0)
     assert started.worlds.steps.tolist() == [4, 0, 4] and started.next_seed == 105
     assert started.policy.age[1] == started.policy._config.every_steps
     # The world that started anew had seed 104, an even one, and has to keep its success as well.
-    started.collect(6)
+    started.collect(6, 1.0)
     assert started.worlds.steps.tolist() == [0, 6, 0] and started.next_seed == 107
 
 
@@ -263,13 +263,13 @@ def test_rollouts_go_on_from_their_state():
         rollouts("PushedLine-v0", source="random"),
         rollouts("PushedLine-v0", source="random"),
     )
-    first.collect(3)
+    first.collect(3, 1.0)
     state = {name: value.copy() for name, value in first.state().items()}
     torch.manual_seed(7)
-    expected = first.collect(4)
+    expected = first.collect(4, 1.0)
     again.restore(state)
     torch.manual_seed(7)
-    for a, b in zip(again.collect(4), expected, strict=True):
+    for a, b in zip(again.collect(4, 1.0), expected, strict=True):
         np.testing.assert_array_equal(a, b)
     assert again.next_seed == first.next_seed
 

@@ -33,7 +33,7 @@ def test_an_oracles_subgoal_is_one_move_ahead_and_leaves_the_world_as_it_is(task
     before = worlds.state.copy()
     policy = subgoal_policy(oracle_led(task), worlds, "cpu")
     assert isinstance(policy, OracleSubgoals)
-    policy.act(worlds.observation, worlds.achieved_goal, worlds.desired_goal, explore=False)
+    policy.act(worlds.observation, worlds.achieved_goal, worlds.desired_goal)
     np.testing.assert_array_equal(worlds.state, before)
     way = (policy.subgoal - worlds.achieved_goal).reshape(WORLDS, -1, 3)
     assert (np.linalg.norm(way, axis=2).max(axis=1) > 0.02).all()
@@ -43,7 +43,7 @@ def test_stacks_first_subgoal_brings_one_block_to_its_goal_or_out_of_the_way():
     worlds = Worlds(TASKS["stack"], WORLDS)
     worlds.reset(range(WORLDS))
     policy = OracleSubgoals(oracle_led("stack"), worlds, "cpu")
-    policy.act(worlds.observation, worlds.achieved_goal, worlds.desired_goal, explore=False)
+    policy.act(worlds.observation, worlds.achieved_goal, worlds.desired_goal)
     moved = np.linalg.norm((policy.subgoal - worlds.achieved_goal).reshape(WORLDS, 3, 3), axis=2)
     assert ((moved > 0.02).sum(axis=1) == 1).all()
 

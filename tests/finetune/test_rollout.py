@@ -37,9 +37,9 @@ def counting_policy(worlds: int = 2, **changes: object) -> SubgoalPolicy:
     return SubgoalPolicy(agent, worlds)
 
 
-def step(policy: SubgoalPolicy, achieved=None, desired=FAR, explore: bool = False) -> np.ndarray:
+def step(policy: SubgoalPolicy, achieved=None, desired=FAR, noise: float = 0.0) -> np.ndarray:
     achieved = np.zeros((2, 2), np.float32) if achieved is None else achieved
-    return policy.act(achieved, achieved, desired, explore=explore)
+    return policy.act(achieved, achieved, desired, noise)
 
 
 def test_a_subgoal_lasts_for_t_steps():
@@ -91,7 +91,7 @@ def test_without_subgoals_the_final_goal_is_followed_alone():
 def test_random_subgoals_are_goals_that_the_dataset_achieved():
     policy = counting_policy(worlds=50, source="random", candidates=4)
     nowhere, far = np.zeros((50, 2), np.float32), np.full((50, 2), 9.0, np.float32)
-    policy.act(nowhere, nowhere, far, explore=False)
+    policy.act(nowhere, nowhere, far)
     bank = policy._agent.bank.numpy()
     assert (policy.subgoal[:, None] == bank).all(-1).any(1).all()
     assert len(np.unique(policy.subgoal, axis=0)) > 40
@@ -107,15 +107,15 @@ def test_the_candidates_asked_for_are_k():
     assert seen == [7]
 
 
-@pytest.mark.parametrize("explore", [True, False])
-def test_actions_are_float32_within_bounds_and_head_for_the_subgoal(explore):
+@pytest.mark.parametrize("noise", [0.0, 0.5, 1.0])
+def test_actions_are_float32_within_bounds_and_head_for_the_subgoal(noise):
     policy = counting_policy()
     # The linear actor's mean is the subgoal's x.
     policy._agent.sac.actor.body[-1].weight.data[0, 2] = 1.0
     policy._agent.sac.actor.body[-1].bias.data[1] = -5.0
-    action = step(policy, explore=explore)
+    action = step(policy, noise=noise)
     assert action.shape == (2, 1) and action.dtype == np.float32
-    np.testing.assert_allclose(action, np.tanh(1.0), atol=0.05 if explore else 1e-6)
+    np.testing.assert_allclose(action, np.tanh(1.0), atol=0.05 if noise else 1e-6)
     assert (np.abs(action) <= 1).all()
 
 

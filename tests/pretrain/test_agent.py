@@ -44,7 +44,7 @@ def test_an_agent_that_was_saved_does_the_same(tmp_path, features, generator):
         torch.manual_seed(1)
         answers.append(
             [
-                each.sac.act(observation, goal, explore=True),
+                each.sac.act(observation, goal, 1.0),
                 each.sac.value(observation, goal),
                 *each.proposer.propose(observation, goal, 7),
                 each.bank,

@@ -71,15 +71,15 @@ def test_actions_far_out_have_finite_log_probabilities():
     assert log_prob.isfinite().all() and (action.abs() <= 1).all()
 
 
-def test_without_exploring_the_action_is_the_mean():
+def test_an_action_is_the_mean_and_as_much_noise_as_is_asked_for():
     sac = make_sac()
-    sac.actor.body[-1].bias.data[0] = 0.5
-    still, moving = (
-        sac.act(torch.zeros(50, 1), torch.zeros(50, 1), explore=explore)
-        for explore in (False, True)
-    )
-    torch.testing.assert_close(still, torch.full((50, 1), 0.5).tanh())
-    assert moving.std() > 0.01 and (moving.abs() <= 1).all()
+    sac.actor.body[-1].bias.data[:] = torch.tensor([0.5, -1.0])
+    many = torch.zeros(20_000, 1)
+    still, half, whole = (sac.act(many, many, noise) for noise in (0.0, 0.5, 1.0))
+    torch.testing.assert_close(still, torch.full((20_000, 1), 0.5).tanh())
+    for moving, noise in ((half, 0.5), (whole, 1.0)):
+        assert moving.atanh().std().item() == pytest.approx(noise * torch.e**-1, rel=0.05)
+        assert (moving.abs() <= 1).all()
 
 
 def test_the_value_is_the_lesser_twin_less_the_price_of_certainty():
@@ -149,7 +149,7 @@ def test_the_actor_climbs_the_critic():
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    assert sac.act(torch.zeros(1, 1), torch.zeros(1, 1), explore=False).item() > 0.7
+    assert sac.act(torch.zeros(1, 1), torch.zeros(1, 1)).item() > 0.7
 
 
 @pytest.mark.parametrize(
