@@ -12,7 +12,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -295,9 +295,3 @@ def _open(folder: Path, spec: DatasetSpec) -> DatasetArrays:
         arrays[name] = array
     info = json.loads((folder / "info.json").read_text())
     return DatasetArrays(spec=spec, info=info, **arrays)
-
-
-def episode_slices(arrays: DatasetArrays) -> Iterator[slice]:
-    """Yield the rows of each episode."""
-    for start, stop in zip(arrays.episode_start[:-1], arrays.episode_start[1:], strict=True):
-        yield slice(int(start), int(stop))

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
 from storage_samples import random_episode, spec_of
 
 from eisp_data.errors import DataError
-from eisp_data.storage.cache import episode_slices, fingerprint, load_arrays, load_images
+from eisp_data.storage.cache import DatasetArrays, fingerprint, load_arrays, load_images
 from eisp_data.storage.lerobot import DatasetWriter
 
 ROWS = ("observation", "achieved_goal", "success", "sim_state")
@@ -31,6 +32,12 @@ def check(arrays, episodes):
         assert np.array_equal(arrays.desired_goal[number], episode.desired_goal)
         assert arrays.seed[number] == episode.seed
         assert arrays.info[number] == episode.info
+
+
+def episode_slices(arrays: DatasetArrays) -> Iterator[slice]:
+    """Yield the rows of each episode."""
+    for start, stop in zip(arrays.episode_start[:-1], arrays.episode_start[1:], strict=True):
+        yield slice(int(start), int(stop))
 
 
 def test_rows_are_the_episodes_one_after_the_other(make_dataset):
