@@ -20,6 +20,8 @@ from eisp_data.storage.video import encode_video
 
 STORY_FRAMES = 6
 MARGIN = 4
+LEAST_HEIGHT = 240
+"""Of a frame in the storyboard, pixels, about."""
 SIZE = (480, 360)
 """Width and height of a drawn frame, pixels."""
 
@@ -122,15 +124,19 @@ def story_rows(length: int, count: int = STORY_FRAMES) -> list[int]:
 
 
 def storyboard(frames: np.ndarray, count: int = STORY_FRAMES) -> np.ndarray:
-    """Return some (T, H, W, 3) frames, evenly spaced, in two rows of one picture."""
-    rows = story_rows(len(frames), count)
-    _, height, width, _ = frames.shape
+    """Return some (T, H, W, 3) frames, evenly spaced, in two rows of one picture.
+
+    Frames of a small camera are enlarged, each pixel to a square.
+    """
+    larger = max(1, LEAST_HEIGHT // frames.shape[1])
+    chosen = frames[story_rows(len(frames), count)].repeat(larger, axis=1).repeat(larger, axis=2)
+    _, height, width, _ = chosen.shape
     across = -(-count // 2)
     size = (2 * (height + MARGIN) - MARGIN, across * (width + MARGIN) - MARGIN, 3)
     page = np.full(size, 255, np.uint8)
-    for place, row in enumerate(rows):
+    for place, frame in enumerate(chosen):
         top, left = place // across * (height + MARGIN), place % across * (width + MARGIN)
-        page[top : top + height, left : left + width] = frames[row]
+        page[top : top + height, left : left + width] = frame
     return page
 
 
