@@ -12,7 +12,7 @@ from finetune.evaluate import evaluate
 from pretrain.agent import Agent
 
 POLICIES = sorted((Path(__file__).parents[2] / "datasets" / "policies").iterdir())
-EPISODES = 8
+EPISODES = 16
 
 
 @pytest.mark.parametrize("folder", POLICIES, ids=lambda folder: folder.name)
