@@ -63,7 +63,7 @@ class Ours:
     Args:
         options: sizes.
         layers: hidden sizes.
-        precision: of products, "medium" for bf16 or "highest" for fp32.
+        precision: of products, "bf16" or, for fp32, "ieee".
     """
 
     def __init__(self, options: Options, layers: tuple[int, ...], precision: str) -> None:
@@ -86,7 +86,7 @@ class Ours:
     def update(self, count: int) -> None:
         """Take so many updates."""
         torch.set_num_threads(max(1, self._options.threads // 2))
-        torch.set_float32_matmul_precision(self._precision)
+        torch.backends.mkldnn.matmul.fp32_precision = self._precision
         for _ in range(count):
             start = time.perf_counter()
             batch = self._data.transitions(self._options.batch_size, self._mix, self._rng)
@@ -154,7 +154,7 @@ class Peer:
     def update(self, count: int) -> None:
         """Take so many updates."""
         torch.set_num_threads(self._options.threads)
-        torch.set_float32_matmul_precision("highest")
+        torch.backends.mkldnn.matmul.fp32_precision = "ieee"
         self._model.train(count, self._options.batch_size)
 
 
@@ -168,7 +168,7 @@ def limit(options: Options, layers: tuple[int, ...]) -> float:
     forward = 2 * actor + 6 * critic
     backward = 2 * actor - (S + G) * first + 2 * (2 * critic - (S + G + A) * first) + 2 * critic
     torch.set_num_threads(options.threads)
-    torch.set_float32_matmul_precision("highest")
+    torch.backends.mkldnn.matmul.fp32_precision = "ieee"
     left, right = torch.randn(options.batch_size, first), torch.randn(first, first)
     seconds = timed(lambda: [left @ right for _ in range(50)]) / 50
     rate = left.numel() * first / seconds
@@ -185,10 +185,10 @@ def timed(work: Callable[[], object]) -> float:
 
 def compare(options: Options, layers: tuple[int, ...]) -> None:
     """Print the rates of one network size."""
-    ours = Ours(options, layers, "medium")
+    ours = Ours(options, layers, "bf16")
     learners: dict[str, Ours | Peer] = {
         "ours": ours,
-        "ours, fp32": Ours(options, layers, "highest"),
+        "ours, fp32": Ours(options, layers, "ieee"),
     }
     learners["stable-baselines3"] = Peer(options, layers, "stable-baselines3")
     if find_spec("sbx"):

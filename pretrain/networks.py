@@ -1,8 +1,7 @@
 """Multilayer perceptrons, single and in ensembles.
 
-Their hidden layers are bf16 where torch may take bf16 for fp32 products (``pretrain.device`` allows
-it) and the processor multiplies it natively: twice as fast. Parameters, sums, losses and the last
-layer stay fp32.
+Their hidden layers are bf16 where ``pretrain.device`` allows it and the processor multiplies it
+natively: twice as fast. Parameters, sums, losses and the last layer stay fp32.
 """
 
 from __future__ import annotations
@@ -15,7 +14,8 @@ from torch import Tensor, nn
 
 def hidden_dtype(inputs: Tensor) -> torch.dtype:
     """Return the type of the hidden layers behind these inputs."""
-    fast = inputs.device.type == "cpu" and torch.get_float32_matmul_precision() == "medium"
+    allowed = torch.backends.mkldnn.matmul.fp32_precision  # type: ignore[attr-defined]
+    fast = inputs.device.type == "cpu" and allowed == "bf16"
     return torch.bfloat16 if fast and torch.cpu._is_avx512_bf16_supported() else inputs.dtype
 
 

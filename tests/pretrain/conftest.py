@@ -8,4 +8,4 @@ import torch
 def fp32_products():
     """Undo what a run allows: it sets the precision of products for the whole process."""
     yield
-    torch.set_float32_matmul_precision("highest")
+    torch.backends.mkldnn.matmul.fp32_precision = "ieee"

@@ -43,7 +43,7 @@ def test_a_perceptron_without_hidden_layers_is_linear():
 
 @pytest.fixture
 def bf16_allowed():
-    torch.set_float32_matmul_precision("medium")
+    torch.backends.mkldnn.matmul.fp32_precision = "bf16"
     if hidden_dtype(torch.zeros(1)) != torch.bfloat16:
         pytest.skip("this processor has no bf16 products")
 
@@ -56,8 +56,8 @@ def test_bf16_hidden_layers_give_nearly_what_fp32_gives_and_fp32_gradients(netwo
     torch.manual_seed(0)
     inputs = torch.randn(500, 40)
     found = []
-    for precision in ("medium", "highest"):
-        torch.set_float32_matmul_precision(precision)
+    for precision in ("bf16", "ieee"):
+        torch.backends.mkldnn.matmul.fp32_precision = precision
         network.zero_grad()
         output = network(inputs)
         output.square().mean().backward()
