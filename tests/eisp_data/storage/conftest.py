@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from storage_samples import random_episode, spec_of
 
+from eisp_data.cli.data import main
 from eisp_data.episode import Episode
 from eisp_data.storage.writer import DatasetWriter
 
@@ -41,3 +43,22 @@ def make_dataset(tmp_path: Path) -> Callable[..., tuple[Path, list[Episode]]]:
         return tmp_path / name, episodes
 
     return make
+
+
+@pytest.fixture
+def eisp_data(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., tuple[int, str, str]]:
+    """Return a function that runs ``eisp-data`` and returns status, stdout and stderr."""
+
+    def run(*words: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["eisp-data", *map(str, words)])
+        status = 0
+        try:
+            main()
+        except SystemExit as stop:
+            status = int(stop.code or 0)
+        said = capsys.readouterr()
+        return status, said.out, said.err
+
+    return run

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from storage_samples import assert_same
 
-from eisp_data.cli.data import COMMANDS, main
+from eisp_data.cli.data import COMMANDS
 from eisp_data.episode import Episode
 from eisp_data.errors import ConfigError
 from eisp_data.sim.worlds import Worlds
@@ -24,23 +24,6 @@ from eisp_data.tasks.registry import get_task
 from eisp_data.view import waypoints
 
 STEPS = 8
-
-
-@pytest.fixture
-def eisp_data(monkeypatch, capsys):
-    """Return a function that runs ``eisp-data`` and returns status, stdout and stderr."""
-
-    def run(*words):
-        monkeypatch.setattr(sys, "argv", ["eisp-data", *map(str, words)])
-        status = 0
-        try:
-            main()
-        except SystemExit as stop:
-            status = int(stop.code or 0)
-        said = capsys.readouterr()
-        return status, said.out, said.err
-
-    return run
 
 
 @pytest.fixture

@@ -4,34 +4,13 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
-import pytest
-
-from eisp_data.cli.data import main
 from eisp_data.storage.mcap.reader import McapLog
 from eisp_data.storage.mcap.summary import summary
 
 Command = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def eisp_data(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
-    """Return a function that runs ``eisp-data`` and returns status, stdout and stderr."""
-
-    def run(*words: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["eisp-data", *map(str, words)])
-        status = 0
-        try:
-            main()
-        except SystemExit as stop:
-            status = int(stop.code or 0)
-        said = capsys.readouterr()
-        return status, said.out, said.err
-
-    return run
 
 
 def test_a_file_without_its_end_is_summed_up_like_a_whole_one(
