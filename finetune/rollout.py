@@ -59,7 +59,8 @@ class SubgoalPolicy:
         reached = self.reached(achieved_goal)
         renew = np.flatnonzero(reached | (self.age >= self._config.every_steps))
         if len(renew):
-            self._notice_stuck(renew, reached, achieved_goal)
+            met = np.linalg.norm(achieved_goal - desired_goal, axis=1) <= self._config.final_m
+            self._notice_stuck(renew, reached | met, achieved_goal)
             chosen = self._choose(
                 renew, observation[renew], achieved_goal[renew], desired_goal[renew]
             )
@@ -78,16 +79,17 @@ class SubgoalPolicy:
         return self._agent.sac.act(seen, target, noise).cpu().numpy()
 
     def _notice_stuck(
-        self, renew: np.ndarray, reached: np.ndarray, achieved_goal: np.ndarray
+        self, renew: np.ndarray, arrived: np.ndarray, achieved_goal: np.ndarray
     ) -> None:
         """Mark the worlds in which a subgoal was not reached and nothing has moved for its sake.
 
         A policy without noise that has come to a standstill stays there. Its own noise frees it:
-        until the next subgoal its actions are sampled.
+        until the next subgoal its actions are sampled. Where the final goal is met, nothing is to
+        move: noise would topple the tower.
         """
         way = np.abs(achieved_goal[renew] - self.start[renew]).max(axis=1)
         still = way < self._config.reached_m / 2
-        self.stuck[renew] = still & ~reached[renew] & self._config.sample_when_stuck
+        self.stuck[renew] = still & ~arrived[renew] & self._config.sample_when_stuck
         self.start[renew] = achieved_goal[renew]
 
     def _choose(

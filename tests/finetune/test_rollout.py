@@ -131,6 +131,15 @@ def test_a_policy_at_a_standstill_samples_its_actions_until_something_moves():
     assert (moved == moved[0]).all()
 
 
+def test_where_the_final_goal_is_met_nobody_is_stuck_however_still():
+    policy = counting_policy()
+    # Within final_m of the goal, and not within reached_m of the subgoal.
+    near = np.array([[0.04, 0.0], [0.06, 0.0]], np.float32)
+    actions = np.stack([step(policy, near, np.zeros((2, 2), np.float32)) for _ in range(10)])
+    assert (actions[:, 0] == actions[0, 0]).all()
+    assert actions[5:, 1].std() > 0.01
+
+
 def test_after_a_reset_nobody_is_stuck():
     policy = counting_policy()
     for _ in range(10):
