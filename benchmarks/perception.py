@@ -22,6 +22,7 @@ import tyro
 
 from eisp_data.policies.registry import SCRIPTS
 from eisp_data.policies.script import Noise, ScriptedPolicy
+from eisp_data.robots.loop import POLLS
 from eisp_data.robots.motion import CartesianServo
 from eisp_data.robots.mover import Mover
 from eisp_data.robots.robot import CameraFrame
@@ -72,6 +73,10 @@ class Watcher:
     def restart(self) -> None:
         """Forget what was seen."""
         self.tracker = Tracker(self.robot.task, self.robot.calibration, CAMERA, self.robot.arm)
+
+    def follow(self) -> None:
+        """Take in what the joints say, as a session does between two ticks."""
+        self.tracker.update(self.robot.observe())
 
     def look(self, busy_s: list[float], hide: bool = False) -> list[Sample]:
         """Take in what is there now; return how right it is, an item for each object."""
@@ -148,6 +153,9 @@ def scripted(
         if policy.finished[0]:
             break
         mover.send(policy.act(referee.state()[None])[0], safe.observe())
+        for part in range(1, POLLS):
+            robot.wait_until(now + part / POLLS / robot.control_hz)
+            watcher.follow()
         robot.wait_until(now + 1 / robot.control_hz)
     print(
         f"  {task}, seed {seed}: {'solved' if referee.success(goal) else 'not solved'}", flush=True

@@ -19,7 +19,7 @@ from eisp_data.errors import ConfigError, DataError
 from eisp_data.hub_trust import refuse_path, refuse_pickle, verify
 from eisp_data.storage.card import CARD, CITATION, PREVIEW, dataset_card, policy_card
 from eisp_data.storage.checks import Check
-from eisp_data.storage.files import one_line
+from eisp_data.storage.files import make_partial, one_line
 from eisp_data.storage.mcap.check import checks as recording_checks
 from eisp_data.storage.mcap.summary import recordings
 from eisp_data.storage.schema import CODEBASE_VERSION
@@ -184,8 +184,9 @@ def pull(repo_id: str, to: Path, repo_type: str = "dataset", revision: str | Non
 
     if to.exists():
         raise DataError(f"{to}: exists already; choose another folder")
-    partial = to.with_name(f".{to.name}.{os.getpid()}.partial")
     api = HfApi()
+    with _one_line_errors(f"{to}"):
+        partial = make_partial(to)
     try:
         with _one_line_errors(f"{repo_id}: pull"):
             commit = api.repo_info(repo_id, repo_type=repo_type, revision=revision).sha
@@ -199,7 +200,6 @@ def pull(repo_id: str, to: Path, repo_type: str = "dataset", revision: str | Non
             for entry in entries:
                 refuse_path(entry.path)
             total = sum(entry.size for entry in entries)
-            partial.mkdir(parents=True)
             if shutil.disk_usage(partial).free < total:
                 raise DataError(f"{to}: {total} bytes do not fit on the disk")
             for entry in entries:

@@ -187,10 +187,10 @@ class Session:
         # Right after a command there is most time until the next one.
         looks = part == 1
         self._log.sense(looks)
-        if looks:
-            frames = self._log.frames.items()
-            fresh = {name: frame for name, frame in frames if frame.captured_s >= self._since_s}
-            self._eyes.look(fresh, self._log.reading)
+        frames = self._log.frames.items() if looks else ()
+        fresh = {name: frame for name, frame in frames if frame.captured_s >= self._since_s}
+        # Without images, too: when the fingers let go the joints tell, at their own rate.
+        self._eyes.look(fresh, self._log.reading)
 
     def _begin(self, controller: Controller, seen: Seen, seed: int, at_ns: int) -> None:
         self._log.event("episode_start", at_ns, policy=controller.name, seed=seed)

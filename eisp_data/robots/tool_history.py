@@ -65,10 +65,7 @@ class ToolHistory:
         return state
 
     def at(self, time_s: float) -> np.ndarray:
-        """Return the tool's (4, 4) transform to the task then; the ends stand for what is beyond.
-
-        Between two readings the position is interpolated, the rotation is that of the nearer one.
-        """
+        """Return the tool's (4, 4) transform to the task then; the ends stand for what is beyond."""
         after = next((s for s in reversed(self._states) if s.time_s <= time_s), None)
         if after is None:
             return self._states[0].transform_tool_to_task
@@ -77,12 +74,19 @@ class ToolHistory:
             return after.transform_tool_to_task
         later = self._states[index + 1]
         share = (time_s - after.time_s) / (later.time_s - after.time_s)
-        result = (later if share > 0.5 else after).transform_tool_to_task.copy()
-        result[:3, 3] = (1 - share) * after.transform_tool_to_task[
-            :3, 3
-        ] + share * later.transform_tool_to_task[:3, 3]
-        return result
+        return pose_between(after, later, share)
 
     def since(self, time_s: float) -> list[ToolState]:
         """Return the states after that time, oldest first."""
         return [state for state in self._states if state.time_s > time_s]
+
+
+def pose_between(before: ToolState, after: ToolState, share: float) -> np.ndarray:
+    """Return the tool's (4, 4) pose at a share of the time between two states.
+
+    The position is interpolated; the rotation is that of the nearer state.
+    """
+    first, last = before.transform_tool_to_task, after.transform_tool_to_task
+    result = (last if share > 0.5 else first).copy()
+    result[:3, 3] = (1 - share) * first[:3, 3] + share * last[:3, 3]
+    return result

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from functools import partial
 
 import numpy as np
 
@@ -66,17 +67,16 @@ class Tracker:
 
     def update(self, reading: Reading, frame: CameraFrame | None = None) -> Estimates:
         """Take in a reading and, if it is a new one, an image; return what is believed now."""
-        before = self._tools.newest.transform_tool_to_task if self._tools else None
+        before = self._tools.newest if self._tools else None
         tool = self._tools.add(reading)
-        if before is None:
-            before = tool.transform_tool_to_task
+        before = before or tool
         if frame is not None and frame.sequence != self._sequence:
             self._sequence = frame.sequence
             self._see(frame)
         if self._drawer is not None:
-            self._follow_drawer(self._drawer, before, tool)
+            self._follow_drawer(self._drawer, before.transform_tool_to_task, tool)
         for name, block in self._blocks.items():
-            block.follow(before, tool, self._standing_height(name))
+            block.follow(before, tool, partial(self._standing_height, name))
         return self.estimates()
 
     def estimates(self) -> Estimates:
@@ -145,7 +145,8 @@ class Tracker:
             if slid is not None:
                 self._drawer.see(slid[0], frame.captured_s, then, since)
         for name, block in self._blocks.items():
-            fit = self._fit_block(name, block, rays, then)
+            guess = block.expected(frame.captured_s, then)
+            fit = self._fit_block(name, block, rays, guess)
             if fit is not None:
                 block.see(fit, frame.captured_s, then, since)
 
@@ -159,10 +160,14 @@ class Tracker:
                 block.shift((drawer.opening_m - was) * _OPENS)
 
     def _fit_block(
-        self, name: str, block: BlockTrack, rays: dict[int, np.ndarray], tool_then: np.ndarray
+        self,
+        name: str,
+        block: BlockTrack,
+        rays: dict[int, np.ndarray],
+        guess: np.ndarray | None,
     ) -> PoseFit | None:
         """Return the block's pose, with what is known of one that is held or stands."""
-        item, guess = self._marked[name], block.expected(tool_then)
+        item = self._marked[name]
         if block.held and guess is not None:
             return fit_pose(self._view, item, rays, guess, Priors(_HELD_TILT_STD))
         fit = fit_pose(self._view, item, rays, guess, Priors(_TILT_STD))
@@ -211,11 +216,8 @@ class Tracker:
                     heights.append(float(block.pose[2, 3]) + HALF_M)
         return heights
 
-    def _standing_height(self, name: str) -> float:
-        """Return the height at which a block stands if it is let go of here, metres."""
-        pose = self._blocks[name].pose
-        if pose is None:
-            return 0.0
+    def _standing_height(self, name: str, pose: np.ndarray) -> float:
+        """Return the height at which a block stands if it is let go of at a pose (4, 4), metres."""
         below = [
             height + HALF_M
             for height in self._surfaces(name, pose)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
-from eisp_data.robots.cell import inverse
 from eisp_data.robots.contact import drag_drawer, push_out
+from eisp_data.robots.grip import Grip, grip_of
 from eisp_data.robots.pose import PoseFit
 from eisp_data.robots.tool_history import ToolState
 from eisp_data.sim.scene import BLOCK_SIZE_M
@@ -20,15 +22,6 @@ _SLACK_M, _SLACK_M_S, _MOST_SLACK_M = 0.035, 0.8, 0.15
 """How far from where it was believed to be an object may turn up at once; further off, another
 image has to say the same."""
 _AGREE_M = 0.012
-_GRASP_LOW_M, _GRASP_HIGH_M = 0.040, 0.057
-"""Openings at which the fingers may hold a block."""
-_OPENING_M_S = 0.0125
-"""Fingers that move apart faster do not grasp."""
-_BETWEEN_M = np.array([0.030, 0.020, 0.032])
-"""How far off the middle of the fingers a held block may be."""
-_GRASP_STD_M, _SLIP_STD_M = 0.002, 0.0003
-"""How well it is known where the fingers have grasped a block, and what it slips by from one image
-to the next."""
 _LOST_GRIP_M = 0.025
 _CONTRADICTIONS = 2
 
@@ -48,8 +41,8 @@ class BlockTrack:
         self.velocity: np.ndarray = np.zeros(3)
         self.spin: np.ndarray = np.zeros(3)
         self.seen_s = -np.inf
-        self._grasp: np.ndarray | None = None
-        self._grasp_variance: np.ndarray = np.zeros((3, 3))
+        self._grip: Grip | None = None
+        self._free_since_s = -np.inf
         self._seen: np.ndarray | None = None
         self._elsewhere: np.ndarray | None = None
         self._contradictions = 0
@@ -57,11 +50,11 @@ class BlockTrack:
     @property
     def held(self) -> bool:
         """Whether the fingers hold it."""
-        return self._grasp is not None
+        return self._grip is not None
 
-    def expected(self, tool_then: np.ndarray) -> np.ndarray | None:
+    def expected(self, time_s: float, tool_then: np.ndarray) -> np.ndarray | None:
         """Return its (4, 4) pose at a time when the tool was at (4, 4)."""
-        return tool_then @ self._grasp if self._grasp is not None else self.pose
+        return self.pose if self._grip is None else self._grip.block_then(time_s, tool_then)
 
     def see(
         self, fit: PoseFit, captured_s: float, tool_then: np.ndarray, tools: list[ToolState]
@@ -74,14 +67,16 @@ class BlockTrack:
             tool_then: (4, 4), the tool's pose then.
             tools: the tool's states since.
         """
+        if captured_s < self._free_since_s:
+            return  # It was in the fingers then, and they have moved on before they let go.
         pose = fit.transform_object_to_task
-        believed = self.expected(tool_then)
+        believed = self.expected(captured_s, tool_then)
         if believed is not None and self._is_elsewhere(pose, believed, captured_s):
             return
         passed = captured_s - self.seen_s
         self.seen_s = captured_s
-        if self._grasp is not None:
-            self._refine_grasp(inverse(tool_then) @ pose, fit.covariance, tool_then[:3, :3])
+        if self._grip is not None:
+            self._grip.refine(pose, fit.covariance, captured_s, tool_then)
             return
         self._measure_motion(pose, passed)
         still = not self.velocity.any()
@@ -97,31 +92,34 @@ class BlockTrack:
             self._push(before, tool)
             before = tool.transform_tool_to_task
 
-    def follow(self, before: np.ndarray, tool: ToolState, standing_m: float) -> None:
+    def follow(
+        self, before: ToolState, tool: ToolState, standing_m: Callable[[np.ndarray], float]
+    ) -> None:
         """Go on to the tool's newest state: held, pushed, let go of or left alone.
 
         Args:
-            before: (4, 4), the tool's pose at the state before.
+            before: the state before.
             tool: the newest state.
-            standing_m: height at which the block would stand where it is.
+            standing_m: returns the height at which the block would stand if it is let go of at a
+                pose (4, 4).
         """
         if self.pose is None:
             return
-        if self._grasp is not None:
-            if not _GRASP_LOW_M < tool.opening_m < _GRASP_HIGH_M:
-                self._let_go(standing_m)
-            else:
-                self.pose = tool.transform_tool_to_task @ self._grasp
-                arm = self.pose[:3, 3] - tool.transform_tool_to_task[:3, 3]
-                self.velocity = tool.velocity + np.cross(tool.spin, arm)
-                self.spin = tool.spin
-            return
-        self._push(before, tool)
-        if tool.time_s - self.seen_s > 0.1:
-            self.velocity, self.spin = np.zeros(3), np.zeros(3)
-        grasping = _GRASP_LOW_M < tool.opening_m < _GRASP_HIGH_M
-        if grasping and tool.opening_speed_m_s < _OPENING_M_S:
-            self._grasp_if_between(tool)
+        if self._grip is None:
+            self._push(before.transform_tool_to_task, tool)
+            if tool.time_s - self.seen_s > 0.1:
+                self.velocity, self.spin = np.zeros(3), np.zeros(3)
+            self._grip = grip_of(self.pose, before, tool)
+        else:
+            there = self._grip.released(before, tool)
+            if there is not None:
+                self._let_go(there @ self._grip.transform_block_to_tool, standing_m)
+                self._free_since_s = tool.time_s
+        if self._grip is not None:
+            self.pose = tool.transform_tool_to_task @ self._grip.transform_block_to_tool
+            arm = self.pose[:3, 3] - tool.transform_tool_to_task[:3, 3]
+            self.velocity = tool.velocity + np.cross(tool.spin, arm)
+            self.spin = tool.spin
 
     def shift(self, way: np.ndarray) -> None:
         """Move with what it lies in, by (3,) m."""
@@ -145,7 +143,7 @@ class BlockTrack:
         self._elsewhere = pose
         if self._contradictions < _CONTRADICTIONS:
             return True
-        self._elsewhere, self._contradictions, self._grasp, self._seen = None, 0, None, None
+        self._elsewhere, self._contradictions, self._grip, self._seen = None, 0, None, None
         return False
 
     def _measure_motion(self, pose: np.ndarray, passed_s: float) -> None:
@@ -169,35 +167,12 @@ class BlockTrack:
         way = here[:3, 3] - tool_before[:3, 3]
         self.pose = push_out(self.pose, here, tool.opening_m, way)
 
-    def _grasp_if_between(self, tool: ToolState) -> None:
-        assert self.pose is not None
-        grasp = inverse(tool.transform_tool_to_task) @ self.pose
-        if (np.abs(grasp[:3, 3]) < _BETWEEN_M).all():
-            # The fingers meet in the middle.
-            grasp[1, 3] = 0.0
-            self._grasp, self._grasp_variance = grasp, _GRASP_STD_M**2 * np.eye(3)
-            self.pose = tool.transform_tool_to_task @ grasp
-
-    def _refine_grasp(
-        self, measured: np.ndarray, covariance: np.ndarray, rotation: np.ndarray
-    ) -> None:
-        """Take in a measured grasp (4, 4): a Kalman filter of what does not change, but slips."""
-        assert self._grasp is not None
-        noise = rotation.T @ covariance @ rotation
-        before = self._grasp_variance + _SLIP_STD_M**2 * np.eye(3)
-        gain = before @ np.linalg.inv(before + noise)
-        refined = self._grasp.copy()
-        refined[:3, 3] += gain @ (measured[:3, 3] - self._grasp[:3, 3])
-        refined[1, 3] = 0.0
-        self._grasp, self._grasp_variance = refined, (np.eye(3) - gain) @ before
-
-    def _let_go(self, standing_m: float) -> None:
-        """Leave it where it is: on what is below it, if that is near."""
-        assert self.pose is not None
-        self._grasp = self._seen = None
+    def _let_go(self, pose: np.ndarray, standing_m: Callable[[np.ndarray], float]) -> None:
+        """Leave it there: on what is below it, if that is near."""
+        self._grip = self._seen = None
         self.velocity, self.spin = np.zeros(3), np.zeros(3)
-        self.pose = self.pose.copy()
-        self.pose[2, 3] = standing_m
+        self.pose = pose.copy()
+        self.pose[2, 3] = standing_m(pose)
 
 
 class DrawerTrack:

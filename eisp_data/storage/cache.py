@@ -11,7 +11,6 @@ import hashlib
 import json
 import os
 import shutil
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ import numpy as np
 from eisp_data.episode import Scalar
 from eisp_data.errors import DataError
 from eisp_data.storage.episodes import read_index
+from eisp_data.storage.files import make_partial
 from eisp_data.storage.reader import Block, read_blocks, read_episodes, read_spec
 from eisp_data.storage.schema import SIM_STATE_COLUMN
 from eisp_data.storage.spec import DatasetSpec
@@ -175,7 +175,7 @@ def _folder(root: Path) -> Path:
 
 
 def _build(fill: Callable[[Path], None], folder: Path, key: str) -> None:
-    temporary = Path(tempfile.mkdtemp(prefix=".building-", dir=folder.parent))
+    temporary = make_partial(folder.parent / "building")
     try:
         fill(temporary)
         (temporary / "done").touch()

@@ -6,6 +6,9 @@ import fcntl
 import json
 import math
 import os
+import platform
+import shutil
+import uuid
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -48,6 +51,32 @@ def remove_temporaries(folder: Path) -> None:
     """
     for path in folder.rglob(".*.tmp"):
         path.unlink(missing_ok=True)
+
+
+def make_partial(to: Path) -> Path:
+    """Make a hidden folder beside ``to``, to be filled and then renamed to it.
+
+    What killed processes of this machine left there of ``to`` is removed.
+    """
+    ours = f".{to.name}.{platform.node()}."
+    to.parent.mkdir(parents=True, exist_ok=True)
+    for left in to.parent.iterdir():
+        owner = left.name.removeprefix(ours).partition(".")[0]
+        if left.name.startswith(ours) and owner.isdigit() and not _alive(int(owner)):
+            shutil.rmtree(left, ignore_errors=True)
+    partial = to.with_name(f"{ours}{os.getpid()}.{uuid.uuid4().hex[:8]}.partial")
+    partial.mkdir()
+    return partial
+
+
+def _alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass
+    return True
 
 
 def json_text(value: Any) -> str:

@@ -27,7 +27,7 @@ from eisp_data.storage.episodes import (
     position,
     read_parquet,
 )
-from eisp_data.storage.files import sync, write_json
+from eisp_data.storage.files import make_partial, sync, write_json
 from eisp_data.storage.meta import SIDECAR_PATH, info_json, sidecar_json, stats_json, write_tasks
 from eisp_data.storage.reader import runs
 from eisp_data.storage.rows import column_values, read_rows, write_rows
@@ -119,7 +119,6 @@ class Rewriter:
         if to.exists():
             raise DataError(f"{to}: exists already; choose another folder")
         self._to, self._spec, self._recipe = to, spec, recipe
-        self._root = to.with_name(f".{to.name}.{os.getpid()}.partial")
         self._rows: list[dict[str, Any]] = []
         self._stats: list[dict[str, Stats]] = []
         self._frames = self._data_files = 0
@@ -128,7 +127,7 @@ class Rewriter:
 
     def __enter__(self) -> Self:
         """Return the rewriter, its folder made."""
-        self._root.mkdir(parents=True)
+        self._root = make_partial(self._to)
         return self
 
     def __exit__(

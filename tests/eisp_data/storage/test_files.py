@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 
 import pytest
 
-from eisp_data.storage.files import replace_atomically, write_json
+from eisp_data.storage.files import make_partial, replace_atomically, write_json
 
 
 def refuse(text: str) -> float:
@@ -35,3 +38,20 @@ def test_a_write_that_fails_leaves_the_file_before_and_nothing_else(tmp_path):
         replace_atomically(tmp_path / "x", fail)
     assert [path.name for path in tmp_path.iterdir()] == ["x"]
     assert (tmp_path / "x").read_text() == "before"
+
+
+def test_what_killed_processes_have_left_beside_a_folder_is_removed_when_it_is_made_anew(tmp_path):
+    work = """
+import os, pathlib, sys
+from eisp_data.storage.files import make_partial
+for name in ("wanted", "other"):
+    (make_partial(pathlib.Path(sys.argv[1]) / name) / "half").touch()
+os.kill(os.getpid(), 9)
+"""
+    subprocess.run([sys.executable, "-c", work, str(tmp_path)], check=False)
+    ours = make_partial(tmp_path / "wanted")
+    beside = make_partial(tmp_path / "wanted")
+    left = {path for path in tmp_path.iterdir() if path.name.startswith(".other.")}
+    assert len(left) == 1
+    assert set(tmp_path.iterdir()) == {ours, beside} | left
+    os.rename(ours, tmp_path / "wanted")
