@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -65,7 +66,7 @@ class ToolHistory:
         return state
 
     def at(self, time_s: float) -> np.ndarray:
-        """Return the tool's (4, 4) transform to the task then; the ends stand for what is beyond."""
+        """Return the tool's (4, 4) pose to the task then; the ends stand for what is beyond."""
         after = next((s for s in reversed(self._states) if s.time_s <= time_s), None)
         if after is None:
             return self._states[0].transform_tool_to_task
@@ -74,19 +75,26 @@ class ToolHistory:
             return after.transform_tool_to_task
         later = self._states[index + 1]
         share = (time_s - after.time_s) / (later.time_s - after.time_s)
-        return pose_between(after, later, share)
+        return state_between(after, later, share).transform_tool_to_task
 
     def since(self, time_s: float) -> list[ToolState]:
         """Return the states after that time, oldest first."""
         return [state for state in self._states if state.time_s > time_s]
 
 
-def pose_between(before: ToolState, after: ToolState, share: float) -> np.ndarray:
-    """Return the tool's (4, 4) pose at a share of the time between two states.
+def state_between(before: ToolState, after: ToolState, share: float) -> ToolState:
+    """Return the tool's state at a share of the time between two; its rotation is the nearer's."""
 
-    The position is interpolated; the rotation is that of the nearer state.
-    """
-    first, last = before.transform_tool_to_task, after.transform_tool_to_task
-    result = (last if share > 0.5 else first).copy()
-    result[:3, 3] = (1 - share) * first[:3, 3] + share * last[:3, 3]
-    return result
+    def mix(first: Any, last: Any) -> Any:
+        return (1 - share) * first + share * last
+
+    pose = (after if share > 0.5 else before).transform_tool_to_task.copy()
+    pose[:3, 3] = mix(before.transform_tool_to_task[:3, 3], after.transform_tool_to_task[:3, 3])
+    return ToolState(
+        time_s=mix(before.time_s, after.time_s),
+        transform_tool_to_task=pose,
+        velocity=mix(before.velocity, after.velocity),
+        spin=mix(before.spin, after.spin),
+        opening_m=mix(before.opening_m, after.opening_m),
+        opening_speed_m_s=after.opening_speed_m_s,
+    )

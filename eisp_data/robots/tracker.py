@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -31,8 +32,8 @@ _ANY_TILT_STD = 0.5
 _HELD_TILT_STD = 0.1
 _STANDS_M, _STANDS_STD = 0.006, 3.0
 """How far off its place a standing block may seem: so far, and so many standard deviations."""
-_FALL_M = 0.02
-"""A block that is let go of falls no further."""
+_SUNK_M = 0.01
+"""A block may seem so far below what it stands on."""
 _TRAY_HALF_M = (0.060, 0.070)
 _UNKNOWN_IMAGES = 5
 """A marker has to be seen so often to be one."""
@@ -148,16 +149,28 @@ class Tracker:
             guess = block.expected(frame.captured_s, then)
             fit = self._fit_block(name, block, rays, guess)
             if fit is not None:
+                fit = self._taken_along(fit, frame.captured_s)
                 block.see(fit, frame.captured_s, then, since)
 
     def _follow_drawer(self, drawer: DrawerTrack, before: np.ndarray, tool: ToolState) -> None:
         """Let the drawer follow the fingers, and what lies in it follow the drawer."""
-        inside = [block for block in self._blocks.values() if self._in_tray(block.pose)]
         was = drawer.opening_m
+        inside = [block for block in self._blocks.values() if self._in_tray(block.pose, was)]
         drawer.follow(before, tool)
         if drawer.opening_m is not None and was is not None:
             for block in inside:
                 block.shift((drawer.opening_m - was) * _OPENS)
+
+    def _taken_along(self, fit: PoseFit, captured_s: float) -> PoseFit:
+        """Return the pose of a block that an image shows, with what the drawer did to it since."""
+        if self._drawer is None or self._drawer.opening_m is None:
+            return fit
+        was = self._drawer.at(captured_s)
+        if not self._in_tray(fit.transform_object_to_task, was):
+            return fit
+        pose = fit.transform_object_to_task.copy()
+        pose[:3, 3] += (self._drawer.opening_m - was) * _OPENS
+        return replace(fit, transform_object_to_task=pose)
 
     def _fit_block(
         self,
@@ -207,7 +220,7 @@ class Tracker:
     def _surfaces(self, name: str, pose: np.ndarray) -> list[float]:
         """Return the heights (m) of all that a block may stand on where it is."""
         heights = [0.0]
-        if self._in_tray(pose):
+        if self._drawer is not None and self._in_tray(pose, self._drawer.opening_m):
             heights.append(TRAY_CENTRE_M[2] - HALF_M)
         for other, block in self._blocks.items():
             if other != name and block.pose is not None and not block.held:
@@ -218,17 +231,14 @@ class Tracker:
 
     def _standing_height(self, name: str, pose: np.ndarray) -> float:
         """Return the height at which a block stands if it is let go of at a pose (4, 4), metres."""
-        below = [
-            height + HALF_M
-            for height in self._surfaces(name, pose)
-            if abs(height + HALF_M - pose[2, 3]) < _FALL_M
-        ]
-        return max(below, default=float(pose[2, 3]))
+        heights = [height + HALF_M for height in self._surfaces(name, pose)]
+        return max((h for h in heights if h < pose[2, 3] + _SUNK_M), default=HALF_M)
 
-    def _in_tray(self, pose: np.ndarray | None) -> bool:
-        if self._drawer is None or self._drawer.opening_m is None or pose is None:
+    def _in_tray(self, pose: np.ndarray | None, opening_m: float | None) -> bool:
+        """Return whether a block at (4, 4) is in the drawer, if that is as far open."""
+        if opening_m is None or pose is None:
             return False
-        x, y, z = pose[:3, 3] - np.array(TRAY_CENTRE_M) - self._drawer.opening_m * _OPENS
+        x, y, z = pose[:3, 3] - np.array(TRAY_CENTRE_M) - opening_m * _OPENS
         return abs(x) < _TRAY_HALF_M[0] and abs(y) < _TRAY_HALF_M[1] and abs(z) < 2 * HALF_M
 
     def _watch_table(self, corners: dict[int, np.ndarray]) -> None:

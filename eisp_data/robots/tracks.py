@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 
 import numpy as np
 
 from eisp_data.robots.contact import drag_drawer, push_out
+from eisp_data.robots.fall import Fall
 from eisp_data.robots.grip import Grip, grip_of
 from eisp_data.robots.pose import PoseFit
 from eisp_data.robots.tool_history import ToolState
@@ -24,6 +26,7 @@ image has to say the same."""
 _AGREE_M = 0.012
 _LOST_GRIP_M = 0.025
 _CONTRADICTIONS = 2
+_PAST = 200
 
 
 class BlockTrack:
@@ -42,6 +45,7 @@ class BlockTrack:
         self.spin: np.ndarray = np.zeros(3)
         self.seen_s = -np.inf
         self._grip: Grip | None = None
+        self._fall: Fall | None = None
         self._free_since_s = -np.inf
         self._seen: np.ndarray | None = None
         self._elsewhere: np.ndarray | None = None
@@ -68,7 +72,7 @@ class BlockTrack:
             tools: the tool's states since.
         """
         if captured_s < self._free_since_s:
-            return  # It was in the fingers then, and they have moved on before they let go.
+            return  # It was in the fingers then, or in the air.
         pose = fit.transform_object_to_task
         believed = self.expected(captured_s, tool_then)
         if believed is not None and self._is_elsewhere(pose, believed, captured_s):
@@ -106,20 +110,26 @@ class BlockTrack:
         if self.pose is None:
             return
         if self._grip is None:
-            self._push(before.transform_tool_to_task, tool)
-            if tool.time_s - self.seen_s > 0.1:
-                self.velocity, self.spin = np.zeros(3), np.zeros(3)
-            self._grip = grip_of(self.pose, before, tool)
+            self._go_on_alone(before, tool)
         else:
-            there = self._grip.released(before, tool)
-            if there is not None:
-                self._let_go(there @ self._grip.transform_block_to_tool, standing_m)
-                self._free_since_s = tool.time_s
+            moment = self._grip.released(before, tool)
+            if moment is not None:
+                self._let_go(self._grip, moment, standing_m)
         if self._grip is not None:
             self.pose = tool.transform_tool_to_task @ self._grip.transform_block_to_tool
-            arm = self.pose[:3, 3] - tool.transform_tool_to_task[:3, 3]
-            self.velocity = tool.velocity + np.cross(tool.spin, arm)
-            self.spin = tool.spin
+            self.velocity, self.spin = _velocity_at(self.pose, tool), tool.spin
+
+    def _go_on_alone(self, before: ToolState, tool: ToolState) -> None:
+        assert self.pose is not None
+        if self._fall is not None:
+            self.pose = self._fall.pose(tool.time_s)
+            if tool.time_s < self._fall.landed_s:
+                return
+            self._fall = None
+        self._push(before.transform_tool_to_task, tool)
+        if tool.time_s - self.seen_s > 0.1:
+            self.velocity, self.spin = np.zeros(3), np.zeros(3)
+        self._grip = grip_of(self.pose, before, tool)
 
     def shift(self, way: np.ndarray) -> None:
         """Move with what it lies in, by (3,) m."""
@@ -167,12 +177,16 @@ class BlockTrack:
         way = here[:3, 3] - tool_before[:3, 3]
         self.pose = push_out(self.pose, here, tool.opening_m, way)
 
-    def _let_go(self, pose: np.ndarray, standing_m: Callable[[np.ndarray], float]) -> None:
-        """Leave it there: on what is below it, if that is near."""
+    def _let_go(
+        self, grip: Grip, moment: ToolState, standing_m: Callable[[np.ndarray], float]
+    ) -> None:
+        """Let it fall on what is below it, with the speed that it has."""
+        pose = moment.transform_tool_to_task @ grip.transform_block_to_tool
+        self._fall = Fall(pose, _velocity_at(pose, moment), moment.time_s, standing_m(pose))
+        self._free_since_s = self._fall.landed_s
         self._grip = self._seen = None
         self.velocity, self.spin = np.zeros(3), np.zeros(3)
-        self.pose = pose.copy()
-        self.pose[2, 3] = standing_m(pose)
+        self.pose = pose
 
 
 class DrawerTrack:
@@ -189,6 +203,12 @@ class DrawerTrack:
         self.speed_m_s = 0.0
         self.seen_s = -np.inf
         self._seen_m: float | None = None
+        self._past: deque[tuple[float, float]] = deque(maxlen=_PAST)
+
+    def at(self, time_s: float) -> float:
+        """Return how far it was open at a time of the last second, metres, as is believed now."""
+        times, openings = zip(*self._past, strict=True)
+        return float(np.interp(time_s, times, openings))
 
     def see(
         self, opening_m: float, captured_s: float, tool_then: np.ndarray, tools: list[ToolState]
@@ -200,7 +220,10 @@ class DrawerTrack:
             way = opening_m - self._seen_m
             self.speed_m_s = way / passed if abs(way) > _STILL_M / 3 else 0.0
         self.seen_s, self._seen_m = captured_s, opening_m
+        while self._past and self._past[-1][0] >= captured_s:
+            self._past.pop()
         self.opening_m = opening_m
+        self._past.append((captured_s, opening_m))
         for tool in tools:
             self.follow(tool_then, tool)
             tool_then = tool.transform_tool_to_task
@@ -209,3 +232,10 @@ class DrawerTrack:
         """Go on to the tool's newest state from when it was at (4, 4)."""
         if self.opening_m is not None:
             self.opening_m = drag_drawer(self.opening_m, before, tool.transform_tool_to_task)
+            self._past.append((tool.time_s, self.opening_m))
+
+
+def _velocity_at(pose: np.ndarray, tool: ToolState) -> np.ndarray:
+    """Return the velocity (3,) m/s of what the tool holds at a pose (4, 4)."""
+    arm = pose[:3, 3] - tool.transform_tool_to_task[:3, 3]
+    return tool.velocity + np.cross(tool.spin, arm)
