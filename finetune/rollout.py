@@ -9,6 +9,11 @@ from torch import Tensor
 from finetune.selector import select
 from pretrain.agent import Agent
 
+_LET_GO_STEPS = 10
+"""When the final goal has been met for so many steps, what is so is the goal."""
+_REST_STEPS = 30
+"""After so many the gripper stands still."""
+
 
 class SubgoalPolicy:
     """Acts in N worlds at once, each with a subgoal of its own.
@@ -18,6 +23,7 @@ class SubgoalPolicy:
         age: (N,) int64, steps for which it has been.
         start: (N, G) float32, where all was when it was chosen.
         stuck: (N,) bool, whether for the sake of the one before it nothing moved.
+        met: (N,) int64, for how many steps in a row the final goal has been met.
     """
 
     def __init__(self, agent: Agent, worlds: int, device: str = "cpu") -> None:
@@ -27,11 +33,13 @@ class SubgoalPolicy:
         self.age = np.full(worlds, self._config.every_steps)
         self.start = np.full_like(self.subgoal, np.inf)
         self.stuck = np.zeros(worlds, bool)
+        self.met = np.zeros(worlds, np.int64)
 
     def reset(self, worlds: np.ndarray) -> None:
         """Forget the subgoals of the named worlds."""
         self.age[worlds] = self._config.every_steps
         self.start[worlds] = np.inf
+        self.met[worlds] = 0
 
     def reached(self, achieved_goal: np.ndarray) -> np.ndarray:
         """Return whether each world is at its subgoal, (N,) bool, of (N, G) achieved goals."""
@@ -57,9 +65,11 @@ class SubgoalPolicy:
             (N, A) float32 in [-1, 1].
         """
         reached = self.reached(achieved_goal)
-        renew = np.flatnonzero(reached | (self.age >= self._config.every_steps))
+        met = np.linalg.norm(achieved_goal - desired_goal, axis=1) <= self._config.final_m
+        self.met = (self.met + 1) * met
+        done = (self.met > _LET_GO_STEPS) & self._config.rest_when_met
+        renew = np.flatnonzero((reached | (self.age >= self._config.every_steps)) & ~done)
         if len(renew):
-            met = np.linalg.norm(achieved_goal - desired_goal, axis=1) <= self._config.final_m
             self._notice_stuck(renew, reached | met, achieved_goal)
             chosen = self._choose(
                 renew, observation[renew], achieved_goal[renew], desired_goal[renew]
@@ -67,11 +77,14 @@ class SubgoalPolicy:
             near = np.linalg.norm(chosen - desired_goal[renew], axis=1) <= self._config.final_m
             self.subgoal[renew] = np.where(near[:, None], desired_goal[renew], chosen)
             self.age[renew] = 0
+        # Nothing is left to correct: the hand lets go. Later it would come back and touch it.
+        self.subgoal[done], self.stuck[done] = achieved_goal[done], False
         self.age += 1
         action = self._act(observation, self.subgoal, noise)
         stuck = np.flatnonzero(self.stuck)
         if len(stuck) and noise < 1:
             action[stuck] = self._act(observation[stuck], self.subgoal[stuck], 1.0)
+        action[done & (self.met > _REST_STEPS)] = 0.0
         return action
 
     def _act(self, observation: np.ndarray, subgoal: np.ndarray, noise: float) -> np.ndarray:

@@ -95,6 +95,7 @@ class Rollouts:
             "age": self.policy.age,
             "start": self.policy.start,
             "stuck": self.policy.stuck,
+            "met": self.policy.met,
             "solved": self.solved,
             "next_seed": np.array(self.next_seed),
         }
@@ -105,7 +106,7 @@ class Rollouts:
         self.worlds.restore_snapshot(
             {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
         )
-        for name in ("subgoal", "age", "start", "stuck"):
+        for name in ("subgoal", "age", "start", "stuck", "met"):
             setattr(self.policy, name, arrays[name])
         self.next_seed, self.solved = int(arrays["next_seed"]), arrays["solved"]
 

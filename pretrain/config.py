@@ -85,6 +85,9 @@ class SubgoalConfig:
     """A subgoal this near to the final goal gives way to it (the paper's epsilon)."""
     sample_when_stuck: bool = True
     """Sample the actions towards a subgoal, if for the sake of the last one nothing moved."""
+    rest_when_met: bool = True
+    """When the final goal has been met for a while, let go and stand still. An action of zero has
+    to mean that."""
 
 
 @dataclass(frozen=True)

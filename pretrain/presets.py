@@ -72,6 +72,8 @@ def _cpu(task: str, root: Path, output_dir: Path) -> PretrainConfig:
             sac=SacConfig(lr=1e-3, gamma=0.98),
             # With the paper's beta its generator says the same of every state: see docs/method.md.
             hybrid=HybridConfig() if known else HybridConfig(beta=_BETA),
+            # What an action of zero does there is not known.
+            subgoals=SubgoalConfig(rest_when_met=known),
             # Each of n objects may be off by a share of the task's tolerance.
             mix=GoalMix(tolerance_m=SUCCESS_DISTANCE_M / objects**0.5),
         ),
@@ -106,6 +108,7 @@ def _paper(task: str, root: Path, output_dir: Path) -> PretrainConfig:
                 every_steps=table.subgoal_steps,
                 reached_m=SUCCESS_DISTANCE_M,
                 sample_when_stuck=False,
+                rest_when_met=False,
             ),
             mix=GoalMix(
                 waypoint=0.0,

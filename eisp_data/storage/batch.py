@@ -15,6 +15,7 @@ from eisp_data.errors import DataError
 from eisp_data.storage import sidecar
 from eisp_data.storage.episodes import EpisodeIndex, episode_row, episode_table, position
 from eisp_data.storage.files import sync
+from eisp_data.storage.parquet import column_names
 from eisp_data.storage.rows import write_rows
 from eisp_data.storage.schema import (
     CHUNK_SIZE,
@@ -238,12 +239,13 @@ def remove_orphans(index: EpisodeIndex, spec: DatasetSpec) -> int:
 def check_columns(index: EpisodeIndex, spec: DatasetSpec) -> None:
     """Raise DataError if the dataset's own columns are gone: another tool wrote it anew."""
     for path in index.tables:
-        if "policy" not in pq.read_schema(path).names:
+        if "policy" not in column_names(path):
             raise DataError(
                 f"{index.root}: was written anew by another tool, which cannot be resumed; "
                 "rewrite it first with eisp-data merge"
             )
     for path in {index.data_path(e) for e in range(len(index))}:
-        missing = [n for n in column_widths(spec) if n not in pq.read_schema(path).names]
+        names = column_names(path)
+        missing = [name for name in column_widths(spec) if name not in names]
         if missing:
             raise DataError(f"{path}: column(s) {missing} are missing")

@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from eisp_data.episode import Scalar
 from eisp_data.errors import DataError
-from eisp_data.storage.files import one_line
+from eisp_data.storage.parquet import column_names, read_parquet
 from eisp_data.storage.schema import CHUNK_SIZE, DATA_PATH, EPISODES_PATH, VIDEO_PATH, video_key
 from eisp_data.storage.spec import DatasetSpec
 from eisp_data.storage.stats import Stats
@@ -64,23 +63,6 @@ class EpisodeIndex:
 def position(number: int) -> tuple[int, int]:
     """Return the chunk and file index of the dataset's file ``number``, counted from 0."""
     return number // CHUNK_SIZE, number % CHUNK_SIZE
-
-
-def read_parquet(
-    path: Path, columns: list[str] | None = None, row_group: int | None = None
-) -> pa.Table:
-    """Read a parquet file or one of its row groups; DataError if it is missing, cut or damaged."""
-    try:
-        # One handle, one thread: a damaged page raises here instead of in a pool.
-        # Our own files carry a checksum of each page; others are read without.
-        file = pq.ParquetFile(path, page_checksum_verification=True)
-        if row_group is not None:
-            return file.read_row_group(row_group, columns=columns, use_threads=False)
-        return file.read(columns=columns, use_threads=False)
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such file") from None
-    except (OSError, pa.ArrowException, ValueError, KeyError) as error:
-        raise DataError(f"{path}: not a readable parquet file ({one_line(error)})") from None
 
 
 def read_index(root: Path) -> EpisodeIndex:
@@ -138,10 +120,7 @@ def _collect(
 
 
 def _pointer_columns(path: Path) -> list[str]:
-    try:
-        names = pq.read_schema(path).names
-    except (OSError, pa.ArrowException) as error:
-        raise DataError(f"{path}: not a readable parquet file ({one_line(error)})") from None
+    names = column_names(path)
     missing = [name for name in POINTERS if name not in names]
     if missing:
         raise DataError(f"{path}: column(s) {missing} are missing")

@@ -11,8 +11,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from eisp_data.storage.episodes import EpisodeIndex, episodes_path, read_index, read_parquet
+from eisp_data.storage.episodes import EpisodeIndex, episodes_path, read_index
 from eisp_data.storage.files import read_json, replace_atomically
+from eisp_data.storage.parquet import read_parquet
 from eisp_data.storage.schema import (
     CHUNK_SIZE,
     CODEBASE_VERSION,

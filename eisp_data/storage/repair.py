@@ -15,14 +15,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from eisp_data.errors import DataError
-from eisp_data.storage.episodes import read_parquet
-from eisp_data.storage.files import WriterLock, one_line, read_json
+from eisp_data.storage.files import WriterLock, read_json
 from eisp_data.storage.meta import SIDECAR_PATH
 from eisp_data.storage.pages import recover_rows
+from eisp_data.storage.parquet import group_rows, read_parquet
 from eisp_data.storage.reader import build_episode
 from eisp_data.storage.rewrite import Rewriter
 from eisp_data.storage.rows import as_table, column_values, read_rows
@@ -168,10 +166,9 @@ def _candidates(
 ) -> Iterator[tuple[int, dict[str, np.ndarray], str]]:
     """Yield first row in the file, columns and sidecar string of what may be an episode."""
     try:
-        metadata = pq.read_metadata(path)
-        counts = [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)]
-    except (OSError, pa.ArrowException) as error:
-        lost.append(f"the footer of {path}: {one_line(error)}")
+        counts = group_rows(path)
+    except DataError as error:
+        lost.append(f"the footer of {error}")
         yield from _without_footer(path, spec, pointers, lost)
         return
     kinds = column_widths(spec)
@@ -258,7 +255,7 @@ def _locate(
             chunk, file = int(path.parent.name[6:]), int(path.stem[5:])
             start = first_row
         target = VIDEO_PATH.format(video_key=key, chunk_index=chunk, file_index=file)
-        if row is None and count_frames(root / target)[0] != pq.read_metadata(path).num_rows:
+        if row is None and count_frames(root / target)[0] != sum(group_rows(path)):
             raise DataError(f"{target}: which of its frames belong to it is not known")
         places[camera] = (root / target, start)
     return places

@@ -25,10 +25,10 @@ from eisp_data.storage.episodes import (
     episode_table,
     episodes_path,
     position,
-    read_parquet,
 )
 from eisp_data.storage.files import make_partial, sync, write_json
 from eisp_data.storage.meta import SIDECAR_PATH, info_json, sidecar_json, stats_json, write_tasks
+from eisp_data.storage.parquet import column_names, read_parquet
 from eisp_data.storage.reader import runs
 from eisp_data.storage.rows import column_values, read_rows, write_rows
 from eisp_data.storage.schema import (
@@ -268,7 +268,7 @@ def _video_stats(index: EpisodeIndex, spec: DatasetSpec) -> dict[int, dict[str, 
         for stat in ("min", "max", "mean", "std", "count", *QUANTILES)
     ]
     for path in index.tables if spec.cameras else ():
-        present = pq.read_schema(path).names
+        present = column_names(path)
         if any(f"stats/{key}/{stat}" not in present for key, stat in names):
             continue
         table = read_parquet(path, ["episode_index", *(f"stats/{k}/{s}" for k, s in names)])

@@ -10,8 +10,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from eisp_data.errors import DataError
-from eisp_data.storage.episodes import read_parquet
 from eisp_data.storage.files import one_line
+from eisp_data.storage.parquet import column_names, read_parquet
 from eisp_data.storage.schema import SIDECAR_COLUMN
 
 
@@ -63,12 +63,7 @@ def read_rows(path: Path, columns: list[str], row_group: int | None = None) -> p
     Raises:
         DataError: the file or a column is not there, or is damaged.
     """
-    try:
-        names = pq.read_schema(path).names
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such file") from None
-    except (OSError, pa.ArrowException) as error:
-        raise DataError(f"{path}: not a readable parquet file ({one_line(error)})") from None
+    names = column_names(path)
     missing = [name for name in columns if name not in names]
     if missing:
         raise DataError(f"{path}: column(s) {missing} are missing")

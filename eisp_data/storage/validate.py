@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from eisp_data.errors import DataError
 from eisp_data.storage import signals
 from eisp_data.storage.checks import Check
-from eisp_data.storage.episodes import EpisodeIndex, read_index, read_parquet
-from eisp_data.storage.files import one_line, read_json
+from eisp_data.storage.episodes import EpisodeIndex, read_index
+from eisp_data.storage.files import read_json
+from eisp_data.storage.parquet import group_rows, read_parquet
 from eisp_data.storage.reader import check_version, read_blocks, read_spec
 from eisp_data.storage.row_checks import ROW_CHECKS
 from eisp_data.storage.schema import INDEX_FEATURES, SIDECAR_COLUMN, column_widths
@@ -119,10 +118,7 @@ def _episode_count(info: dict[str, Any], index: EpisodeIndex) -> Check:
 def _frame_count(info: dict[str, Any], index: EpisodeIndex) -> Check:
     rows = 0
     for path in sorted({index.data_path(e) for e in range(len(index))}):
-        try:
-            rows += pq.read_metadata(path).num_rows
-        except (OSError, pa.ArrowException) as error:
-            raise DataError(f"{path}: {one_line(error)}") from None
+        rows += sum(group_rows(path))
     listed, stated = int(index.length.sum()), info.get("total_frames")
     same = rows == listed == stated
     detail = f"{rows} rows, {listed} in the episode table, {stated} stated"

@@ -140,6 +140,27 @@ def test_where_the_final_goal_is_met_nobody_is_stuck_however_still():
     assert actions[5:, 1].std() > 0.01
 
 
+def test_where_the_final_goal_stays_met_it_is_kept_as_it_is_and_then_nothing_is_done():
+    policy = counting_policy()
+    policy._agent.sac.actor.body[-1].bias.data[:] = 1.0
+    goal = np.zeros((2, 2), np.float32)
+    places = np.array([[0.03, 0.0], [0.07, 0.0]], np.float32)
+    actions = np.stack([step(policy, places, goal) for _ in range(40)])
+    assert (actions[:30, 0] != 0).all() and (actions[30:, 0] == 0).all()
+    assert (actions[:, 1] != 0).all()
+    np.testing.assert_array_equal(policy.subgoal[0], places[0])
+    # It begins anew as soon as the goal is no longer met.
+    step(policy, places + 0.03, goal)
+    assert policy.met.tolist() == [0, 0] and policy.subgoal[0, 0] >= 1.0
+
+
+def test_a_policy_may_be_told_to_go_on_when_the_goal_is_met():
+    policy = counting_policy(rest_when_met=False)
+    policy._agent.sac.actor.body[-1].bias.data[:] = 1.0
+    nowhere = np.zeros((2, 2), np.float32)
+    assert all((step(policy, nowhere, nowhere) != 0).all() for _ in range(40))
+
+
 def test_after_a_reset_nobody_is_stuck():
     policy = counting_policy()
     for _ in range(10):
