@@ -8,7 +8,7 @@ Worlds start anew only between rounds, so that a trajectory is never cut in the 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from eisp_data.errors import ConfigError
-from eisp_data.runs.metrics import MetricsLog
+from eisp_data.runs.metrics import MetricsLog, Speeds
 from eisp_data.sim.gym_worlds import AnyWorlds
 from finetune.config import OnlineConfig
 from finetune.evaluate import Evaluation, evaluate
@@ -176,11 +176,15 @@ class Finetuner:
             self._evaluate(log, {}, start)
         rounds = range(self._round + 1, self.config.rounds + 1)
         bar = tqdm(rounds, "fine-tuning", self.config.rounds, initial=self._round, mininterval=1.0)
+        speeds = Speeds()
         for self._round in bar:
-            self._online.extend(*self._rollouts.collect(self.config.round_steps, self.config.noise))
-            info = self._learn()
+            with speeds.measured("env_steps", self.config.worlds * self.config.round_steps):
+                trajectories = self._rollouts.collect(self.config.round_steps, self.config.noise)
+            self._online.extend(*trajectories)
+            with speeds.measured("updates", self.config.updates):
+                info = self._learn()
             if self._round % self.config.evaluate_every == 0 or self._round == self.config.rounds:
-                result = self._evaluate(log, info, start)
+                result = self._evaluate(log, {**info, **speeds.taken()}, start)
                 bar.set_postfix(success=result.success_last.mean, return_=result.return_.mean)
         log.close()
         return summarise(self._curve)
@@ -213,7 +217,9 @@ class Finetuner:
         source = self._online if self._rng.random() * (new + old) < new else self._offline
         return source.subgoals(self.config.generator_batch_size, self._mix, self._rng)
 
-    def _evaluate(self, log: MetricsLog, info: dict[str, Tensor], start: float) -> Evaluation:
+    def _evaluate(
+        self, log: MetricsLog, info: Mapping[str, Tensor | float], start: float
+    ) -> Evaluation:
         count = self.config.evaluation_episodes
         result = evaluate(
             self.agent, self._evaluation_worlds, count, _SELECTION_SEED, device=self._device

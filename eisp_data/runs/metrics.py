@@ -3,11 +3,37 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from eisp_data.storage.files import replace_atomically
+
+
+class Speeds:
+    """How fast the parts of a run that take turns are, each while it is its turn."""
+
+    def __init__(self) -> None:
+        self._count: defaultdict[str, int] = defaultdict(int)
+        self._spent_s: defaultdict[str, float] = defaultdict(float)
+
+    @contextmanager
+    def measured(self, what: str, count: int) -> Iterator[None]:
+        """Count so many of something that are done in the ``with``."""
+        start = time.perf_counter()
+        yield
+        self._count[what] += count
+        self._spent_s[what] += time.perf_counter() - start
+
+    def taken(self) -> dict[str, float]:
+        """Return ``<what>_per_s`` of each since the last call."""
+        rates = {f"{what}_per_s": n / self._spent_s[what] for what, n in self._count.items()}
+        self._count.clear()
+        self._spent_s.clear()
+        return rates
 
 
 class MetricsLog:

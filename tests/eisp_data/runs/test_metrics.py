@@ -1,9 +1,10 @@
 """The log of a run: whole lines, and none twice after a resume."""
 
 import json
+import time
 from pathlib import Path
 
-from eisp_data.runs.metrics import MetricsLog
+from eisp_data.runs.metrics import MetricsLog, Speeds
 
 
 def lines_of(run: Path) -> list[tuple[str, int]]:
@@ -49,3 +50,15 @@ def test_a_line_that_a_kill_cut_off_is_dropped(tmp_path):
         file.write('{"stage": "pretrain", "upda')
     write(tmp_path, "pretrain", 10, [20])
     assert lines_of(tmp_path) == [("pretrain", 10), ("pretrain", 20)]
+
+
+def test_speeds_are_those_of_each_part_alone_and_since_they_were_taken():
+    speeds = Speeds()
+    for _ in range(2):
+        with speeds.measured("slow", 1):
+            time.sleep(0.02)
+        with speeds.measured("fast", 1000):
+            pass
+    taken = speeds.taken()
+    assert taken["slow_per_s"] <= 50 and taken["fast_per_s"] > 10 * taken["slow_per_s"]
+    assert speeds.taken() == {}
