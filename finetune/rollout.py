@@ -75,7 +75,9 @@ class SubgoalPolicy:
                 renew, observation[renew], achieved_goal[renew], desired_goal[renew]
             )
             near = np.linalg.norm(chosen - desired_goal[renew], axis=1) <= self._config.final_m
-            self.subgoal[renew] = np.where(near[:, None], desired_goal[renew], chosen)
+            # Met, the goal itself is left alone: a generator always knows some other way on.
+            final = near | met[renew]
+            self.subgoal[renew] = np.where(final[:, None], desired_goal[renew], chosen)
             self.age[renew] = 0
         # Nothing is left to correct: the hand lets go. Later it would come back and touch it.
         self.subgoal[done], self.stuck[done] = achieved_goal[done], False

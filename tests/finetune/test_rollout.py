@@ -79,6 +79,14 @@ def test_a_subgoal_near_the_final_goal_gives_way_to_it():
     np.testing.assert_array_equal(policy.subgoal[1], [1.0, 0.0])
 
 
+def test_where_the_final_goal_is_met_nothing_else_is_proposed():
+    policy = counting_policy()
+    here = np.array([[0.04, 0.0], [0.06, 0.0]], np.float32)
+    goal = np.zeros((2, 2), np.float32)
+    step(policy, here, goal)
+    assert policy.subgoal[:, 0].tolist() == [0.0, 1.0]
+
+
 def test_without_subgoals_the_final_goal_is_followed_alone():
     policy = counting_policy(source="none")
     desired = np.array([[3.0, 1.0], [4.0, 2.0]], np.float32)
