@@ -10,7 +10,7 @@ from finetune.selector import select
 from pretrain.agent import Agent
 
 _LET_GO_STEPS = 10
-"""When the final goal has been met for so many steps, what is so is the goal."""
+"""When the final goal has been met for so many steps, and well, what is so is the goal."""
 _REST_STEPS = 30
 """After so many the gripper stands still."""
 
@@ -22,8 +22,9 @@ class SubgoalPolicy:
         subgoal: (N, G) float32, what each world is heading for.
         age: (N,) int64, steps for which it has been.
         start: (N, G) float32, where all was when it was chosen.
-        stuck: (N,) bool, whether for the sake of the one before it nothing moved.
+        stuck: (N,) bool, whether the one before was not reached nor come nearer.
         met: (N,) int64, for how many steps in a row the final goal has been met.
+        idle: (N,) int64, for how many steps no subgoal was chosen but what was so already.
     """
 
     def __init__(self, agent: Agent, worlds: int, device: str = "cpu") -> None:
@@ -34,12 +35,13 @@ class SubgoalPolicy:
         self.start = np.full_like(self.subgoal, np.inf)
         self.stuck = np.zeros(worlds, bool)
         self.met = np.zeros(worlds, np.int64)
+        self.idle = np.zeros(worlds, np.int64)
 
     def reset(self, worlds: np.ndarray) -> None:
         """Forget the subgoals of the named worlds."""
         self.age[worlds] = self._config.every_steps
         self.start[worlds] = np.inf
-        self.met[worlds] = 0
+        self.met[worlds] = self.idle[worlds] = 0
 
     def reached(self, achieved_goal: np.ndarray) -> np.ndarray:
         """Return whether each world is at its subgoal, (N,) bool, of (N, G) achieved goals."""
@@ -65,27 +67,24 @@ class SubgoalPolicy:
             (N, A) float32 in [-1, 1].
         """
         reached = self.reached(achieved_goal)
-        met = np.linalg.norm(achieved_goal - desired_goal, axis=1) <= self._config.final_m
-        self.met = (self.met + 1) * met
+        missed = np.linalg.norm(achieved_goal - desired_goal, axis=1)
+        self.met = (self.met + 1) * (missed <= self._config.final_m)
         done = (self.met > _LET_GO_STEPS) & self._config.rest_when_met
         renew = np.flatnonzero((reached | (self.age >= self._config.every_steps)) & ~done)
         if len(renew):
-            self._notice_stuck(renew, reached | met, achieved_goal)
-            chosen = self._choose(
-                renew, observation[renew], achieved_goal[renew], desired_goal[renew]
-            )
-            near = np.linalg.norm(chosen - desired_goal[renew], axis=1) <= self._config.final_m
-            # Met, the goal itself is left alone: a generator always knows some other way on.
-            final = near | met[renew]
-            self.subgoal[renew] = np.where(final[:, None], desired_goal[renew], chosen)
-            self.age[renew] = 0
-        # Nothing is left to correct: the hand lets go. Later it would come back and touch it.
-        self.subgoal[done], self.stuck[done] = achieved_goal[done], False
+            self._notice_stuck(renew, reached, achieved_goal)
+            self._renew(renew, observation, achieved_goal, desired_goal)
+        # Nothing is left to correct but large errors: the hand lets go.
+        self.subgoal[done], self.stuck[done] = desired_goal[done], False
+        well = done & (missed <= self._config.final_m / 2)
+        self.subgoal[well] = achieved_goal[well]
         self.age += 1
+        self.idle += 1
         action = self._act(observation, self.subgoal, noise)
         stuck = np.flatnonzero(self.stuck)
         if len(stuck) and noise < 1:
             action[stuck] = self._act(observation[stuck], self.subgoal[stuck], 1.0)
+        # It would drift back and touch what it has built.
         action[done & (self.met > _REST_STEPS)] = 0.0
         return action
 
@@ -94,18 +93,39 @@ class SubgoalPolicy:
         return self._agent.sac.act(seen, target, noise).cpu().numpy()
 
     def _notice_stuck(
-        self, renew: np.ndarray, arrived: np.ndarray, achieved_goal: np.ndarray
+        self, renew: np.ndarray, reached: np.ndarray, achieved_goal: np.ndarray
     ) -> None:
-        """Mark the worlds in which a subgoal was not reached and nothing has moved for its sake.
+        """Mark the worlds in which a subgoal was not reached nor come nearer.
 
         A policy without noise that has come to a standstill stays there. Its own noise frees it:
         until the next subgoal its actions are sampled. Where the final goal is met, nothing is to
         move: noise would topple the tower.
         """
-        way = np.abs(achieved_goal[renew] - self.start[renew]).max(axis=1)
-        still = way < self._config.reached_m / 2
-        self.stuck[renew] = still & ~arrived[renew] & self._config.sample_when_stuck
+        was, now = (
+            np.linalg.norm(self.subgoal[renew] - place, axis=1)
+            for place in (self.start[renew], achieved_goal[renew])
+        )
+        still = was - now < self._config.reached_m
+        arrived = reached[renew] | (self.met[renew] > 0)
+        self.stuck[renew] = still & ~arrived & self._config.sample_when_stuck
         self.start[renew] = achieved_goal[renew]
+
+    def _renew(
+        self,
+        renew: np.ndarray,
+        observation: np.ndarray,
+        achieved_goal: np.ndarray,
+        desired_goal: np.ndarray,
+    ) -> None:
+        """Choose the next subgoals of the worlds named by ``renew``."""
+        desired = desired_goal[renew]
+        chosen = self._choose(renew, observation[renew], achieved_goal[renew], desired)
+        near = np.linalg.norm(chosen - desired, axis=1) <= self._config.final_m
+        # A goal that is met is left alone: a generator always knows some other way on.
+        final = near | (self.met[renew] > 0)
+        self.subgoal[renew] = np.where(final[:, None], desired, chosen)
+        self.age[renew] = 0
+        self.idle[renew[~self.reached(achieved_goal)[renew]]] = 0
 
     def _choose(
         self,
@@ -120,7 +140,8 @@ class SubgoalPolicy:
         state, goal = self._tensor(observation), self._tensor(desired_goal)
         candidates, likelihood = self._propose(state, goal)
         here = self._tensor(achieved_goal)
-        return select(self._agent, state, here, candidates, likelihood).cpu().numpy()
+        idle = self._tensor(self.idle[renew] >= self._config.every_steps)
+        return select(self._agent, state, here, candidates, likelihood, idle).cpu().numpy()
 
     def _propose(self, state: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
         count = self._config.candidates

@@ -32,6 +32,7 @@ def select(
     achieved_goal: Tensor,
     candidates: Tensor,
     likelihood: Tensor,
+    idle: Tensor,
 ) -> Tensor:
     """Choose one candidate a row.
 
@@ -41,6 +42,8 @@ def select(
         achieved_goal: (B, G) what is already so.
         candidates: (B, K, G).
         likelihood: (B, K) log-probabilities that the generator gave them.
+        idle: (B,) bool, where the best has been what is so already for too long: there a tenth
+            of the best of the others will do.
 
     Returns:
         (B, G)
@@ -53,7 +56,8 @@ def select(
     if agent.config.subgoals.selector == "likely":
         way = (candidates - achieved_goal[:, None]).norm(dim=-1)
         trivial = way <= agent.config.subgoals.reached_m
-        unlikely = likelihood < likelihood.amax(1, keepdim=True) + _LEAST_WEIGHT
+        compared = likelihood - _DROPPED * (trivial & idle[:, None])
+        unlikely = likelihood < compared.amax(1, keepdim=True) + _LEAST_WEIGHT
         dropped = trivial.float() + unlikely.float()
         score = likelihood + score / _STEPS_PER_NAT - _DROPPED * dropped
     return candidates[torch.arange(batch), score.argmax(1)]

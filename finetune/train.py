@@ -96,6 +96,7 @@ class Rollouts:
             "start": self.policy.start,
             "stuck": self.policy.stuck,
             "met": self.policy.met,
+            "idle": self.policy.idle,
             "solved": self.solved,
             "next_seed": np.array(self.next_seed),
         }
@@ -106,7 +107,7 @@ class Rollouts:
         self.worlds.restore_snapshot(
             {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
         )
-        for name in ("subgoal", "age", "start", "stuck", "met"):
+        for name in ("subgoal", "age", "start", "stuck", "met", "idle"):
             setattr(self.policy, name, arrays[name])
         self.next_seed, self.solved = int(arrays["next_seed"]), arrays["solved"]
 

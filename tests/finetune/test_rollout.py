@@ -132,7 +132,7 @@ def test_a_policy_at_a_standstill_samples_its_actions_until_something_moves():
     still, moving = np.zeros(2, np.float32), np.array([0.5, 0.0], np.float32)
     means = [step(policy) for _ in range(5)]
     assert all((action == means[0]).all() for action in means)
-    # World 1 has moved half a metre when its subgoal is renewed, world 0 has not.
+    # World 1 has come half a metre nearer when its subgoal is renewed, world 0 has not.
     sampled = np.stack([step(policy, np.stack([still, moving])) for _ in range(5)])
     assert (sampled[:, 1] == means[0][1]).all() and sampled[:, 0].std() > 0.01
     moved = np.stack([step(policy, np.stack([moving, moving + 1.0])) for _ in range(3)])
@@ -152,14 +152,31 @@ def test_where_the_final_goal_stays_met_it_is_kept_as_it_is_and_then_nothing_is_
     policy = counting_policy()
     policy._agent.sac.actor.body[-1].bias.data[:] = 1.0
     goal = np.zeros((2, 2), np.float32)
-    places = np.array([[0.03, 0.0], [0.07, 0.0]], np.float32)
+    places = np.array([[0.02, 0.0], [0.07, 0.0]], np.float32)
     actions = np.stack([step(policy, places, goal) for _ in range(40)])
     assert (actions[:30, 0] != 0).all() and (actions[30:, 0] == 0).all()
     assert (actions[:, 1] != 0).all()
     np.testing.assert_array_equal(policy.subgoal[0], places[0])
     # It begins anew as soon as the goal is no longer met.
-    step(policy, places + 0.03, goal)
+    step(policy, places + 0.04, goal)
     assert policy.met.tolist() == [0, 0] and policy.subgoal[0, 0] >= 1.0
+
+
+def test_a_goal_that_is_met_only_just_is_still_corrected():
+    policy = counting_policy()
+    goal = np.zeros((2, 2), np.float32)
+    for _ in range(20):
+        step(policy, np.array([[0.04, 0.0], [0.02, 0.0]], np.float32), goal)
+    assert policy.subgoal[:, 0].tolist() == [0.0, pytest.approx(0.02)]
+
+
+def test_a_policy_that_finds_all_as_it_should_be_for_long_is_idle():
+    policy = counting_policy()
+    for _ in range(8):
+        step(policy, np.array([[1.0, 0.0], [-3.0, 0.0]], np.float32))
+        policy._agent.proposer.asked = 0
+    # World 0 is where it is to go, at every step anew; world 1 never.
+    assert policy.idle.tolist() == [8, 3]
 
 
 def test_a_policy_may_be_told_to_go_on_when_the_goal_is_met():

@@ -12,6 +12,7 @@ from pretrain.config import SubgoalConfig
 
 HERE = torch.zeros(1, 2)
 EQUAL = torch.zeros(1, 3)
+BUSY, IDLE = torch.tensor([False]), torch.tensor([True])
 
 
 def agent_that_values(selector: str, weight: tuple[float, float], **changes: float) -> Agent:
@@ -21,8 +22,13 @@ def agent_that_values(selector: str, weight: tuple[float, float], **changes: flo
     return agent
 
 
-def choose(agent: Agent, candidates: list[list[float]], likelihood: torch.Tensor = EQUAL):
-    found = select(agent, HERE, HERE, torch.tensor([candidates]), likelihood)
+def choose(
+    agent: Agent,
+    candidates: list[list[float]],
+    likelihood: torch.Tensor = EQUAL,
+    idle: torch.Tensor = BUSY,
+):
+    found = select(agent, HERE, HERE, torch.tensor([candidates]), likelihood, idle)
     return found[0].tolist()
 
 
@@ -31,7 +37,9 @@ def test_the_published_rule_takes_the_candidate_of_highest_value(weight):
     agent = agent_that_values("value", weight)
     torch.manual_seed(0)
     candidates = torch.rand(50, 6, 2)
-    found = select(agent, torch.zeros(50, 2), torch.zeros(50, 2), candidates, torch.zeros(50, 6))
+    found = select(
+        agent, torch.zeros(50, 2), torch.zeros(50, 2), candidates, torch.zeros(50, 6), BUSY
+    )
     best = (candidates @ torch.tensor(weight)).argmax(1)
     assert torch.equal(found, candidates[torch.arange(50), best])
 
@@ -58,6 +66,14 @@ def test_candidates_far_less_likely_than_the_best_are_dropped():
     assert choose(agent, candidates, torch.tensor([[0.5, 0.4, 0.3]]).log()) == [1.0, 0.0]
 
 
+def test_what_is_so_already_and_far_likelier_is_dropped_when_nothing_else_was_chosen_for_long():
+    agent = agent_that_values("likely", (0.0, 0.0))
+    candidates = [[0.01, 0.0], [0.5, 0.0], [0.9, 0.0]]
+    likelihood = torch.tensor([[0.97, 0.02, 0.001]]).log()
+    assert choose(agent, candidates, likelihood) == [pytest.approx(0.01), 0.0]
+    assert choose(agent, candidates, likelihood, IDLE) == [0.5, 0.0]
+
+
 @pytest.mark.parametrize("steps", [5.0, 15.0])
 def test_ten_steps_weigh_as_much_as_a_factor_e_of_likelihood(steps):
     agent = agent_that_values("likely", (-steps, 0.0))
@@ -81,7 +97,7 @@ def test_a_single_candidate_is_chosen_without_asking():
 def test_every_row_chooses_for_itself():
     agent = agent_that_values("value", (1.0, 0.0))
     candidates = torch.tensor([[[0.2, 0.0], [0.4, 0.0]], [[0.9, 0.0], [0.1, 0.0]]])
-    found = select(agent, HERE.expand(2, 2), HERE.expand(2, 2), candidates, torch.zeros(2, 2))
+    found = select(agent, HERE.expand(2, 2), HERE.expand(2, 2), candidates, torch.zeros(2, 2), BUSY)
     assert found[:, 0].tolist() == pytest.approx([0.4, 0.9])
 
 
