@@ -28,8 +28,9 @@ _UNKNOWN = Figure("–")
 
 
 def percent(value: float) -> str:
-    """Return a share as text, in percent."""
-    return f"{100 * value:.0f}%".replace("-", "−")
+    """Return a share as text, in percent; one of 99.8% has not been 100%."""
+    digits = 1 if 0.99 < value < 0.9995 else 0
+    return f"{100 * value:.{digits}f}%".replace("-", "−")
 
 
 def signed(value: float) -> str:

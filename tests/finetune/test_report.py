@@ -10,6 +10,7 @@ import pytest
 
 from eisp_data.errors import ConfigError, DataError
 from finetune.report import write_report
+from finetune.results import percent
 from finetune.video import film_length, middle_frame, write_video
 
 VOID = {"meta", "br"}
@@ -189,3 +190,8 @@ def test_a_film_ends_a_second_after_the_goal_is_reached_for_good():
     assert film_length([False] * 40) == 40
     assert film_length([False] * 10 + [True] * 90) == 35
     assert film_length([True] * 5 + [False] * 5 + [True] * 10) == 20
+
+
+def test_a_share_is_not_rounded_up_to_all():
+    shown = [percent(value) for value in (0.0, 0.5, 0.985, 0.998, 1.0, -0.02)]
+    assert shown == ["0%", "50%", "98%", "99.8%", "100%", "−2%"]
