@@ -12,6 +12,8 @@ import numpy as np
 
 from eisp_data.robots.markers import dictionary
 
+_LEAST_PERIMETER = 0.06
+"""Of the image's longer side: 10 pixels an edge, less than what a code can be read from."""
 _SAMPLES = 12
 """Places along an edge at which it is looked for."""
 _FIRST, _LAST = 0.12, 0.88
@@ -52,6 +54,7 @@ class MarkerDetector:
         # Two sizes of window are enough for prints of one size, and a third faster than three.
         settings.adaptiveThreshWinSizeMin, settings.adaptiveThreshWinSizeMax = 3, 23
         settings.adaptiveThreshWinSizeStep = 20
+        settings.minMarkerPerimeterRate = _LEAST_PERIMETER
         self._detector = cv2.aruco.ArucoDetector(dictionary(), settings)
 
     def detect(self, image: np.ndarray) -> Detections:

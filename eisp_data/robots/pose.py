@@ -99,18 +99,14 @@ class View:
         Returns:
             (N, 2) px, and (N, 2, 3) px per metre.
         """
-        x, y, z = apply(self._to_camera, points).T
-        depth = np.maximum(z, 0.01)
-        residual = np.stack([x / depth, y / depth], axis=-1) - rays
-        zero = np.zeros_like(x)
-        by_camera = np.stack(
-            [
-                np.stack([1 / depth, zero, -x / depth**2], axis=-1),
-                np.stack([zero, 1 / depth, -y / depth**2], axis=-1),
-            ],
-            axis=1,
-        )
-        return self.focal_px * residual, self.focal_px * by_camera @ self._to_camera[:3, :3]
+        there = apply(self._to_camera, points)
+        depth = np.maximum(there[:, 2:], 0.01)
+        on_plane = there[:, :2] / depth
+        by_camera = np.zeros((len(points), 2, 3))
+        by_camera[:, 0, 0] = by_camera[:, 1, 1] = 1 / depth[:, 0]
+        by_camera[:, :, 2] = -on_plane / depth
+        by_point = self.focal_px * by_camera @ self._to_camera[:3, :3]
+        return self.focal_px * (on_plane - rays), by_point
 
 
 def fit_pose(
@@ -237,14 +233,13 @@ def _normal_equations(
     arm = points @ rotation.T
     residual, by_point = view.residuals(arm + position, rays)
     # A small turn w moves a point by w x arm.
-    by_turn = np.cross(arm[:, None], by_point)
-    slope = np.concatenate([by_turn, by_point], axis=-1) / CORNER_STD_PX
-    scaled = residual / CORNER_STD_PX
-    weight = _weights(residual)
-    weighted = slope * weight[:, None, None]
-    matrix = np.einsum("nij,nik->jk", weighted, slope)
-    gradient = np.einsum("nij,ni->j", weighted, scaled)
-    cost = float((weight[:, None] * scaled**2).sum())
+    by_turn = by_point @ _cross_matrices(arm)
+    slope = np.concatenate([by_turn, by_point], axis=-1).reshape(-1, 6) / CORNER_STD_PX
+    scaled = residual.ravel() / CORNER_STD_PX
+    weight = np.repeat(_weights(residual), 2)
+    weighted = slope.T * weight
+    matrix, gradient = weighted @ slope, weighted @ scaled
+    cost = float(weight @ scaled**2)
     # Never singular, however few the corners.
     matrix.flat[::7] += 1e-6
     if priors.height_std_m is not None:
@@ -262,6 +257,15 @@ def _normal_equations(
         gradient[:3] += by_tilt.T @ off
         cost += float(off @ off)
     return matrix, gradient, residual, cost
+
+
+def _cross_matrices(arm: np.ndarray) -> np.ndarray:
+    """Return the (N, 3, 3) matrices that take a turn (3,) to how it moves each of (N, 3) arms."""
+    matrices = np.zeros((len(arm), 3, 3))
+    x, y, z = arm.T
+    matrices[:, 0, 1], matrices[:, 0, 2], matrices[:, 1, 2] = z, -y, x
+    matrices[:, 1, 0], matrices[:, 2, 0], matrices[:, 2, 1] = -z, y, -x
+    return matrices
 
 
 def _weights(residual: np.ndarray) -> np.ndarray:
