@@ -37,7 +37,11 @@ def replace_atomically(path: Path, write: Callable[[Path], object]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
+        temporary.touch()
+        mode = temporary.stat().st_mode
         write(temporary)
+        # safetensors lets only its owner read what it writes.
+        temporary.chmod(mode)
         sync(temporary)
         os.replace(temporary, path)
     finally:

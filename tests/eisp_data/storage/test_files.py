@@ -7,7 +7,9 @@ import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 from eisp_data.storage.files import make_partial, replace_atomically, write_json
 
@@ -25,6 +27,12 @@ def test_what_json_has_no_number_for_becomes_null(tmp_path):
     write_json(tmp_path / "x.json", value)
     read = json.loads((tmp_path / "x.json").read_text(), parse_constant=refuse)
     assert read == {"a": None, "b": [1.5, [None, None]], "c": {"d": 1, "e": "NaN"}}
+
+
+def test_a_file_may_be_read_by_whom_the_umask_lets_whoever_wrote_it(tmp_path):
+    replace_atomically(tmp_path / "x", lambda path: save_file({"a": np.zeros(3)}, path))
+    (tmp_path / "y").touch()
+    assert (tmp_path / "x").stat().st_mode == (tmp_path / "y").stat().st_mode
 
 
 def test_a_write_that_fails_leaves_the_file_before_and_nothing_else(tmp_path):
