@@ -90,6 +90,16 @@ class FinetuneConfig:
     """Go on from the newest checkpoint in the output folder."""
 
 
+def from_nothing(output_dir: Path) -> FinetuneConfig:
+    """Return what to begin with without a policy: nothing can be unlearned yet."""
+    return FinetuneConfig(
+        output_dir,
+        # What an action of zero does in an environment from elsewhere is not known.
+        subgoals=SubgoalConfig(rest_when_met=False),
+        online=OnlineConfig(noise=1.0, lr=1e-3),
+    )
+
+
 @dataclass(frozen=True)
 class EvaluateConfig:
     """Evaluation of a policy."""

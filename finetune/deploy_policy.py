@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 
+from eisp_data.robots.look import FRESH_S
 from eisp_data.robots.record_controllers import Decision
 from eisp_data.robots.session_view import Seen
 from eisp_data.tasks.base import Task, is_success
@@ -18,6 +20,8 @@ _SURPRISE_M = 0.01
 """A look that shows an object this far from where it was believed to be calls for a new plan."""
 _CLEAR_M = 0.05
 """An arm that is this far from all objects is in the middle of no push and no pull."""
+_HIDDEN_STEPS = 5
+"""What is at its goal but has been out of sight for so long is looked at: it may be gone."""
 _DONE_STEPS = 3
 """It has done with them once that has been so for so many steps."""
 
@@ -37,6 +41,8 @@ class PolicyController:
 
     def begin(self, seen: Seen, goal: np.ndarray, seed: int) -> None:
         """Forget the last episode."""
+        # The same seed gives the same episode, however many there were before.
+        torch.manual_seed(seed)
         self._goal, self._begun = goal, False
         self._rollout.reset(np.array([0]))
 
@@ -51,7 +57,11 @@ class PolicyController:
         self.at_subgoal = self._begun and bool(self._rollout.reached(achieved)[0])
         self._begun = True
         action = self._rollout.act(seen.observation[None], achieved, self._goal[None])[0]
-        return Decision(action.astype(float), subgoal=self._rollout.subgoal[0].copy())
+        subgoal = self._rollout.subgoal[0].copy()
+        if np.array_equal(subgoal, achieved[0]):
+            # It rests where the goal is met: that is no new subgoal at each step.
+            subgoal = self._goal.copy()
+        return Decision(action.astype(float), subgoal=subgoal)
 
 
 class Looking:
@@ -63,14 +73,14 @@ class Looking:
     def __init__(self, inner: PolicyController, task: Task) -> None:
         self.name = inner.name
         self._inner, self._task = inner, task
-        self._done = self._since = self._clung = 0
+        self._done = self._since = self._clung = self._hidden = 0
         self._due, self._goal = False, np.empty(0)
         self._believed: np.ndarray | None = None
 
     def begin(self, seen: Seen, goal: np.ndarray, seed: int) -> None:
         """Start an episode."""
         self._due, self._goal, self._believed = False, goal, None
-        self._done = self._since = self._clung = 0
+        self._done = self._since = self._clung = self._hidden = 0
         self._inner.begin(seen, goal, seed)
 
     def act(self, seen: Seen) -> Decision:
@@ -90,10 +100,13 @@ class Looking:
         met = bool(is_success(seen.achieved_goal, self._goal))
         self._clung = self._clung + 1 if met and not hands_off else 0
         clings = self._clung >= _CLINGING_STEPS
-        if not clings and not (self._due and self._done >= _DONE_STEPS):
+        unsure = met and hands_off and seen.age_s > FRESH_S
+        self._hidden = self._hidden + 1 if unsure else 0
+        hides = self._hidden >= _HIDDEN_STEPS
+        if not clings and not hides and not (self._due and self._done >= _DONE_STEPS):
             return decision
         if clings:
             self._inner.replan()
-        self._due, self._since, self._clung = False, 0, 0
+        self._due, self._since, self._clung, self._hidden = False, 0, 0, 0
         self._believed = seen.achieved_goal.copy()
         return Decision(np.zeros(4), looking=True)

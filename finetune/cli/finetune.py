@@ -9,7 +9,7 @@ from pathlib import Path
 from eisp_data.cli.run import fail, run
 from eisp_data.cli.words import given, saved_run, take
 from eisp_data.errors import EispError
-from finetune.config import FinetuneConfig
+from finetune.config import FinetuneConfig, from_nothing
 from pretrain.saved import saved_subgoals
 
 
@@ -25,7 +25,8 @@ def main() -> None:
 def _command(config: FinetuneConfig) -> None:
     """Fine-tune a pretrained policy online, with subgoals.
 
-    --subgoals.source random and --subgoals.source none show what the subgoals are worth.
+    --subgoals.source random and --subgoals.source none show what the subgoals are worth. Without a
+    policy it begins with all of the noise and a learning rate of 1e-3.
     """
     from finetune.run import finetune
 
@@ -46,5 +47,5 @@ def _start(words: list[str]) -> FinetuneConfig | None:
     _, path = take(words, "--policy.path")
     folder = Path("runs/finetune")
     if path is None:
-        return FinetuneConfig(folder)
+        return from_nothing(folder)
     return FinetuneConfig(folder, subgoals=saved_subgoals(Path(path)))

@@ -141,6 +141,17 @@ def test_what_is_at_its_goal_and_held_there_is_let_go_of() -> None:
     assert 20 <= first <= 30
 
 
+def test_what_is_believed_at_its_goal_but_out_of_sight_is_looked_at() -> None:
+    looking = Looking(Inner(), STACK)
+    now = seen_at(np.array([0.3, 0.0, 0.2]), 2 * FINGER_TRAVEL_M)
+    looking.begin(now, now.achieved_goal, 0)
+    assert not any(looking.act(now).looking for _ in range(20))
+    hidden = replace(now.estimates.objects["block0"], age_s=1.0)
+    objects = {**now.estimates.objects, "block0": hidden}
+    unseen = replace(now, estimates=replace(now.estimates, objects=objects))
+    assert [looking.act(unseen).looking for _ in range(5)] == [False] * 4 + [True]
+
+
 def camera_view() -> View:
     lens = CameraIntrinsics(640, 480, np.array([[920.0, 0, 319.5], [0, 920.0, 239.5], [0, 0, 1.0]]))
     return View(CameraCalibration(lens, transform_camera_to_task()), np.eye(4))

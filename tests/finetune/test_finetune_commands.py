@@ -6,7 +6,9 @@ import sys
 
 import pytest
 
+from eisp_data.config import load_yaml
 from finetune.cli import evaluate, finetune
+from finetune.config import FinetuneConfig
 
 SMALL = [
     "--online.rounds", "1", "--online.worlds", "2", "--online.updates", "2",
@@ -51,6 +53,14 @@ def test_a_policy_is_fine_tuned_resumed_and_evaluated(pretrained, tmp_path, monk
     table = capsys.readouterr().out
     assert table.startswith("stack: 2 episodes from seed 1000")
     assert all(row in table for row in ("success at the last step", "relative to the oracle"))
+
+
+def test_without_a_policy_it_learns_fast_and_explores(tmp_path, monkeypatch):
+    monkeypatch.setattr("finetune.run._FIRST_EPISODES", 3)
+    run(monkeypatch, finetune, "--env.id", "FetchReach-v4", "--output-dir", tmp_path, *SMALL)
+    saved = load_yaml(FinetuneConfig, tmp_path / "finetune.yaml")
+    assert (saved.online.lr, saved.online.noise, saved.online.worlds) == (1e-3, 1.0, 2)
+    assert not saved.subgoals.rest_when_met
 
 
 @pytest.mark.parametrize(
