@@ -22,6 +22,8 @@ from eisp_data.tasks.base import GRIPPER_DIM, is_success
 
 _MET_TICKS = 12
 """An episode is a success once its goal has been met for half a second."""
+_UNSEEN_TICKS = 150
+"""What is out of sight has to have met it for so long: somebody may have taken it away."""
 _STAND_TICKS = 8
 """What is wrong with the first images is said before the arm moves."""
 
@@ -130,7 +132,8 @@ class Session:
                 self._begin(controller, seen, seed, at_ns)
             self._record(seen, at_ns)
             met = met + 1 if self._is_met(seen) else 0
-            ending = self._ending(step, most_ticks, met)
+            sure = met >= (_MET_TICKS if seen.age_s < FRESH_S else _UNSEEN_TICKS)
+            ending = self._ending(step, most_ticks, sure)
             if ending is not None:
                 return self._ended(ending, step, seen)
             decision = self._decide(controller, seen)
@@ -198,11 +201,11 @@ class Session:
             self._log.vector("/desired_goal", self._goal, at_ns, role=GOAL)
         controller.begin(seen, self._goal, seed)
 
-    def _ending(self, step: int, most_ticks: int, met: int) -> str | None:
+    def _ending(self, step: int, most_ticks: int, met: bool) -> str | None:
         """Return how the episode ends now, None if it goes on."""
         if self._stop.given:
             return ""
-        if met >= _MET_TICKS:
+        if met:
             self._log.event("success")
             return "success"
         return "timeout" if step == most_ticks else None

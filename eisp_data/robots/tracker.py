@@ -194,7 +194,7 @@ class Tracker:
             tilted = fit_pose(self._view, item, rays, guess, Priors(_ANY_TILT_STD))
             # Freedom to tilt makes up for wrong corners, too: it has to explain much.
             if fit is None or (tilted is not None and tilted.error_px < 0.5 * fit.error_px):
-                return tilted
+                return None if tilted is None or _is_sunk(tilted) else tilted
         standing = self._stand(name, fit, rays)
         if standing is not None:
             return standing
@@ -273,3 +273,11 @@ class Tracker:
             # The median: one that is half covered says nothing of the camera.
             off = float(np.median(np.concatenate(distances)))
             self._off_px = off if self._off_px is None else 0.7 * self._off_px + 0.3 * off
+
+
+def _is_sunk(fit: PoseFit) -> bool:
+    """Whether a block would be in the table, which on edge it is less than ever.
+
+    So it seems where the arm covers a half of the only marker in sight.
+    """
+    return bool(fit.transform_object_to_task[2, 3] < HALF_M - _STANDS_M)
