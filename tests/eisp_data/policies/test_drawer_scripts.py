@@ -66,4 +66,7 @@ def test_demonstrations_move_block_and_drawer_and_end_at_rest(demonstrations, na
     moved_block = ways[:, :2].max(axis=1) > 0.05
     assert moved_block.mean() > 0.8 and (ways[:, 2] > 0.04).mean() > 0.8
     assert np.mean([task.settled(e.sim_state[-1:])[0] for e in episodes]) > 0.8
-    assert all(100 <= len(e) <= 400 for e in episodes)
+    # What has fallen off the table ends its episode.
+    lasting = [e for e in episodes if e.achieved_goal[-1, 2] > 0.0]
+    assert len(lasting) > 0.9 * len(episodes)
+    assert all(100 <= len(e) <= 400 for e in lasting)
