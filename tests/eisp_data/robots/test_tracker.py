@@ -89,14 +89,20 @@ def test_everything_on_the_table_is_found_and_the_observation_is_the_simulators(
         assert now.observation.dtype == now.achieved_goal.dtype == np.float32
 
 
+def about_to_grasp_the_first_block(robot: TwinRobot) -> Session:
+    """Return a session whose open fingers are around block 0, the others out of the way."""
+    robot.referee.move_block(0, np.array([0.30, 0.0, 0.025]))
+    robot.referee.move_block(1, np.array([0.38, 0.14, 0.025]))
+    robot.referee.move_block(2, np.array([0.38, -0.14, 0.025]))
+    session = Session(robot)
+    session.run(5)
+    session.go_and_wait([0.30, 0.0, 0.025], 12)
+    return session
+
+
 def test_a_held_block_is_known_for_two_seconds_without_any_image():
     with TwinRobot(seed=0) as robot:
-        robot.referee.move_block(0, np.array([0.30, 0.0, 0.025]))
-        robot.referee.move_block(1, np.array([0.38, 0.14, 0.025]))
-        robot.referee.move_block(2, np.array([0.38, -0.14, 0.025]))
-        session = Session(robot)
-        session.run(5)
-        session.go_and_wait([0.30, 0.0, 0.025], 12)
+        session = about_to_grasp_the_first_block(robot)
         session.opening_m = 0.0
         assert session.run(6).objects["block0"].held
         session.go_and_wait([0.30, 0.0, 0.12], 12, blind=True)
@@ -117,12 +123,7 @@ def test_a_held_block_is_known_for_two_seconds_without_any_image():
 @pytest.mark.parametrize("rise_m", [0.08, 0.14])
 def test_an_arm_in_a_hurry_takes_a_block_no_further_than_its_fingers_do(rise_m):
     with TwinRobot(seed=0) as robot:
-        robot.referee.move_block(0, np.array([0.30, 0.0, 0.025]))
-        robot.referee.move_block(1, np.array([0.38, 0.14, 0.025]))
-        robot.referee.move_block(2, np.array([0.38, -0.14, 0.025]))
-        session = Session(robot)
-        session.run(5)
-        session.go_and_wait([0.30, 0.0, 0.025], 12)
+        session = about_to_grasp_the_first_block(robot)
         # It rises while the fingers are on their way, and no image tells what became of the block.
         session.opening_m = 0.0
         session.run(2, blind=True)
