@@ -82,7 +82,7 @@ def record(
         # Copied once for all worlds: the recorders keep rows of it.
         seen = _Seen(worlds)
         # What has fallen off the table would fall for the rest of the episode.
-        ended, over = seen.done | seen.truncated | seen.hopeless, actor.finished
+        ended, over = seen.done | seen.truncated | worlds.hopeless, actor.finished
         for world, recorder in enumerate(recorders):
             if recorder is not None:
                 recorder.add(action[world], seen, bool(over[world]))
@@ -136,7 +136,6 @@ class _Seen:
         self.state = worlds.state.copy()
         self.done = worlds.done.copy()
         self.truncated = worlds.truncated.copy()
-        self.hopeless = worlds.hopeless
         if isinstance(worlds, GymWorlds):
             self.observation = worlds.observation.copy()
             self.achieved_goal = worlds.achieved_goal.copy()
