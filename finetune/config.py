@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pretrain.config import DeviceName, SubgoalConfig
+from pretrain.config import AgentConfig, DeviceName, SubgoalConfig
 
 
 @dataclass(frozen=True)
@@ -90,14 +90,11 @@ class FinetuneConfig:
     """Go on from the newest checkpoint in the output folder."""
 
 
-def from_nothing(output_dir: Path) -> FinetuneConfig:
-    """Return what to begin with without a policy: nothing can be unlearned yet."""
-    return FinetuneConfig(
-        output_dir,
-        # What an action of zero does in an environment from elsewhere is not known.
-        subgoals=SubgoalConfig(rest_when_met=False),
-        online=OnlineConfig(noise=1.0, lr=1e-3),
-    )
+def from_nothing(output_dir: Path, agent: AgentConfig) -> FinetuneConfig:
+    """Return what to begin with without a policy: a fresh agent's own settings, and all of its
+    noise, for nothing can be unlearned yet."""
+    online = OnlineConfig(noise=1.0, lr=agent.sac.lr)
+    return FinetuneConfig(output_dir, subgoals=agent.subgoals, online=online)
 
 
 @dataclass(frozen=True)

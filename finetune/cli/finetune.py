@@ -10,6 +10,7 @@ from eisp_data.cli.run import fail, run
 from eisp_data.cli.words import given, saved_run, take
 from eisp_data.errors import EispError
 from finetune.config import FinetuneConfig, from_nothing
+from pretrain.presets import preset
 from pretrain.saved import saved_subgoals
 
 
@@ -47,5 +48,6 @@ def _start(words: list[str]) -> FinetuneConfig | None:
     _, path = take(words, "--policy.path")
     folder = Path("runs/finetune")
     if path is None:
-        return from_nothing(folder)
+        _, env_id = take(words, "--env.id")
+        return from_nothing(folder, preset("cpu", env_id or "", Path(), folder).agent)
     return FinetuneConfig(folder, subgoals=saved_subgoals(Path(path)))
