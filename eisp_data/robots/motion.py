@@ -6,6 +6,7 @@ Joint targets that come from here are smooth on their own; ``safety`` still has 
 from __future__ import annotations
 
 import numpy as np
+import pinocchio as pin
 
 from eisp_data.errors import RobotError
 from eisp_data.robots.arms import get_arm
@@ -19,6 +20,8 @@ POLICY_HZ = 25.0
 
 _ACCELERATION_M_S2 = 8.0
 """Of the tool; full speed within an eighth of a second."""
+_TURN_RAD_S = 1.0
+"""How fast a tool that was tilted comes upright again: at once would be a jump of the joints."""
 _OPEN_M = 2 * FINGER_TRAVEL_M
 
 _PEAK_VELOCITY, _PEAK_ACCELERATION = 1.875, 10.0 / 3.0**0.5
@@ -29,6 +32,8 @@ _SHARE = 0.8
 
 class CartesianServo:
     """Turns the policies' actions into joint targets, the fingers pointing down all the while.
+
+    Where something has tilted them they come upright again, bit by bit.
 
     Attributes:
         fingers_closed: whether the gripper stays closed whatever the actions say.
@@ -60,8 +65,7 @@ class CartesianServo:
 
     def tool_in_task(self, joint_position: np.ndarray) -> np.ndarray:
         """Return the (3,) point between the fingertips in the task's frame, at (J,) rad."""
-        point = self._kinematics.forward(joint_position)[:3, 3]
-        return self._placed[:3, :3].T @ (point - self._placed[:3, 3])
+        return self._to_task(self._kinematics.forward(joint_position)[:3, 3])
 
     def start(self) -> None:
         """Begin from an arm at rest."""
@@ -78,7 +82,8 @@ class CartesianServo:
         """
         action = np.asarray(action, float)
         way = action[:3] if np.isfinite(action[:3]).all() else np.zeros(3)
-        here = self.tool_in_task(sent)
+        pose = self._kinematics.forward(sent)
+        here = self._to_task(pose[:3, 3])
         moving = np.zeros(3) if self._here is None else (here - self._here) / self._period_s
         wanted = self._speed * ACTION_SCALE_M * POLICY_HZ * np.clip(way, -1.0, 1.0)
         change = wanted - moving
@@ -93,19 +98,33 @@ class CartesianServo:
         opening = float(np.clip((action[3] + 1.0) / 2.0, 0.0, 1.0)) * _OPEN_M
         if self.fingers_closed:
             opening = 0.0
-        joints = self._kinematics.track(fingers_down(target, self._placed), sent)
-        return JointCommand(joints, opening)
+        wanted_pose = fingers_down(target, self._placed)
+        wanted_pose[:3, :3] = self._turned(pose[:3, :3], wanted_pose[:3, :3])
+        return JointCommand(self._kinematics.track(wanted_pose, sent), opening)
 
     def give_way(self, joint_position: np.ndarray) -> np.ndarray:
         """Return the targets (J,) rad that leave an arm where it was pressed to, at (J,) rad.
 
         Where that is outside of the workspace it is brought back: a filter would not let it stay.
+        It stays as tilted as it was pressed: what straightened it would press on.
         """
         here = self.tool_in_task(joint_position)
         inside = np.clip(here, WORKSPACE_LOW_M, WORKSPACE_HIGH_M)
         if np.array_equal(here, inside):
             return joint_position
-        return self._kinematics.track(fingers_down(inside, self._placed), joint_position)
+        pose = self._kinematics.forward(joint_position)
+        pose[:3, 3] += self._placed[:3, :3] @ (inside - here)
+        return self._kinematics.track(pose, joint_position)
+
+    def _to_task(self, point: np.ndarray) -> np.ndarray:
+        """Return a point (3,) of the base's frame in the task's."""
+        return self._placed[:3, :3].T @ (point - self._placed[:3, 3])
+
+    def _turned(self, rotation: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+        """Return the (3, 3) rotation one control period on from one towards another."""
+        turn = pin.log3(rotation.T @ wanted)
+        most = _TURN_RAD_S * self._period_s
+        return rotation @ pin.exp3(turn * min(1.0, most / max(float(np.linalg.norm(turn)), 1e-12)))
 
 
 def joint_path(

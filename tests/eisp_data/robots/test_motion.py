@@ -1,6 +1,7 @@
 """Displacements become smooth joint targets, and ways lead round what is in the way."""
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from eisp_data.errors import RobotError
@@ -9,6 +10,7 @@ from eisp_data.robots.collision import CollisionChecker
 from eisp_data.robots.kinematics import Kinematics
 from eisp_data.robots.motion import CartesianServo, fingers_down, joint_path
 from eisp_data.robots.planning import plan
+from eisp_data.robots.safety import SafetyConfig
 from eisp_data.sim.scene import FINGER_TRAVEL_M, WORKSPACE_HIGH_M
 from eisp_data.tasks.base import ACTION_SCALE_M
 
@@ -79,6 +81,27 @@ def test_an_arm_gives_way_to_where_it_was_pressed_but_not_out_of_the_workspace()
     np.testing.assert_array_equal(servo.give_way(inside), inside)
     place = servo.tool_in_task(servo.give_way(outside))
     np.testing.assert_allclose(place, [0.30, WORKSPACE_HIGH_M[1], 0.15], atol=1e-4)
+
+
+def test_an_arm_that_was_pressed_out_of_the_workspace_stays_as_tilted_as_it_was():
+    kinematics, outside = start_at("ur3", (0.30, 0.23, 0.15))
+    tilted = outside + [0.0, 0.0, 0.0, 0.1, 0.1, 0.0]
+    servo = CartesianServo("ur3", HZ)
+    given = servo.give_way(tilted)
+    assert servo.tool_in_task(given)[1] == pytest.approx(WORKSPACE_HIGH_M[1], abs=1e-4)
+    turn = kinematics.forward(given)[:3, :3].T @ kinematics.forward(tilted)[:3, :3]
+    np.testing.assert_allclose(turn, np.eye(3), atol=2e-3)
+
+
+def test_a_tilted_arm_comes_upright_again_without_a_jump():
+    kinematics, upright = start_at("ur3", (0.34, -0.02, 0.05))
+    pose = kinematics.forward(upright)
+    pose[:3, :3] = pose[:3, :3] @ pin.exp3(np.array([0.0, 0.3, 0.0]))
+    servo = CartesianServo("ur3", HZ)
+    rows, places = drive(servo, kinematics.track(pose, upright), [[0.0, 0.0, 0.0, 0.0]] * 12)
+    assert np.abs(np.diff(rows, axis=0)).max() < SafetyConfig().jump_rad / 2
+    np.testing.assert_allclose(places, np.broadcast_to(places[0], places.shape), atol=1e-3)
+    np.testing.assert_allclose(kinematics.forward(rows[-1])[:3, :3], np.eye(3), atol=1e-3)
 
 
 def test_half_the_speed_is_half_the_way():
