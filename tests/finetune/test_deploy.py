@@ -244,6 +244,23 @@ def test_the_hand_takes_one_finished_block_away_once_and_to_a_free_place() -> No
         assert (away > 0.05).tolist() == [False, False, True]
 
 
+def test_the_hand_comes_before_any_success_however_far_off_a_single_block_is() -> None:
+    pytest.importorskip("pinocchio")
+    from eisp_data.robots.twin.robot import TwinRobot
+
+    task = TASKS["store"]
+    referee = TwinRobot("store").referee
+    goal = referee.reset(0)
+    referee.move_block(0, goal[:3] + [0.0, 0.042, 0.0])
+    assert referee.success(goal)
+    hand = Hand(referee, task)
+    hand.begin(goal, 0)
+    hand_off, decision = seen_at(np.array([0.3, 0, 0.3]), 0.08), Decision(np.zeros(4))
+    for step in range(8):
+        hand(step, hand_off, decision)
+    assert hand.moved and not referee.success(goal)
+
+
 def config_for(tmp_path: Path, policy: Path | None, **options: object) -> DeployConfig:
     settings = {"task": "stack", "output_dir": tmp_path / "out", "realtime": False, **options}
     return DeployConfig(policy=PolicyConfig(policy), **settings)

@@ -168,7 +168,7 @@ def test_a_marker_of_no_object_and_a_hidden_block_are_named():
         session = Session(robot)
         stack = Tracker(get_task("stack"), robot.calibration, CAMERA, "ur3")
         session.tracker = stack
-        session.run(8)
+        session.run(12)
         with pytest.raises(RobotError, match=r"unknown marker (18|20).* in view; this task has"):
             stack.check()
     with TwinRobot("stack", seed=0) as robot:
