@@ -24,6 +24,9 @@ _HIDDEN_STEPS = 5
 """What is at its goal but has been out of sight for so long is looked at: it may be gone."""
 _DONE_STEPS = 3
 """It has done with them once that has been so for so many steps."""
+_STALLED_STEPS, _STILL_M = 40, 0.025
+"""A policy that for so many steps has moved neither the arm nor an object further has come to a
+standstill, or goes to and fro between two subgoals."""
 
 
 class PolicyController:
@@ -67,7 +70,8 @@ class PolicyController:
 class Looking:
     """Asks for a look at the table after each subgoal, once the arm has let go and come away.
 
-    Where the look shows something else than was believed, the policy plans anew.
+    Where the look shows something else than was believed, the policy plans anew. It does so, too,
+    after a look that was asked for because nothing went on.
     """
 
     def __init__(self, inner: PolicyController, task: Task) -> None:
@@ -76,11 +80,13 @@ class Looking:
         self._done = self._since = self._clung = self._hidden = 0
         self._due, self._goal = False, np.empty(0)
         self._believed: np.ndarray | None = None
+        self._places: np.ndarray = np.empty(0)
+        self._still = 0
 
     def begin(self, seen: Seen, goal: np.ndarray, seed: int) -> None:
         """Start an episode."""
         self._due, self._goal, self._believed = False, goal, None
-        self._done = self._since = self._clung = self._hidden = 0
+        self._done = self._since = self._clung = self._hidden = self._still = 0
         self._inner.begin(seen, goal, seed)
 
     def act(self, seen: Seen) -> Decision:
@@ -103,10 +109,21 @@ class Looking:
         unsure = met and hands_off and seen.age_s > FRESH_S
         self._hidden = self._hidden + 1 if unsure else 0
         hides = self._hidden >= _HIDDEN_STEPS
-        if not clings and not hides and not (self._due and self._done >= _DONE_STEPS):
+        stalls = self._stalls(seen)
+        looks = self._due and self._done >= _DONE_STEPS
+        if not (clings or hides or stalls or looks):
             return decision
-        if clings:
+        if clings or stalls:
             self._inner.replan()
-        self._due, self._since, self._clung, self._hidden = False, 0, 0, 0
+        self._due = False
+        self._since = self._clung = self._hidden = self._still = 0
         self._believed = seen.achieved_goal.copy()
         return Decision(np.zeros(4), looking=True)
+
+    def _stalls(self, seen: Seen) -> bool:
+        """Return whether arm and objects have stayed where they are for too long."""
+        places = np.vstack([seen.gripper_m, seen.achieved_goal.reshape(-1, 3)])
+        if not self._still or np.linalg.norm(places - self._places, axis=1).max() > _STILL_M:
+            self._places, self._still = places, 0
+        self._still += 1
+        return self._still > _STALLED_STEPS

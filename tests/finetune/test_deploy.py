@@ -152,6 +152,20 @@ def test_what_is_believed_at_its_goal_but_out_of_sight_is_looked_at() -> None:
     assert [looking.act(unseen).looking for _ in range(5)] == [False] * 4 + [True]
 
 
+def test_a_policy_that_stands_still_looks_and_plans_anew_and_one_that_goes_on_does_not() -> None:
+    inner = Inner()
+    looking = Looking(inner, STACK)
+    place, moving = np.array([0.3, 0.0, 0.2]), np.array([0.0, 0.002, 0.0])
+    looking.begin(seen_at(place, BLOCK_SIZE_M), np.zeros(9), 0)
+    assert not any(
+        looking.act(seen_at(place + step * moving, BLOCK_SIZE_M)).looking for step in range(80)
+    )
+    # To and fro is no way on either.
+    hovering = [place + (step % 2) * 5 * moving for step in range(90)]
+    looks = [looking.act(seen_at(there, BLOCK_SIZE_M)).looking for there in hovering]
+    assert looks.count(True) == 2 and inner.replanned == 2
+
+
 def camera_view() -> View:
     lens = CameraIntrinsics(640, 480, np.array([[920.0, 0, 319.5], [0, 920.0, 239.5], [0, 0, 1.0]]))
     return View(CameraCalibration(lens, transform_camera_to_task()), np.eye(4))
