@@ -41,8 +41,8 @@ def tiny_training(root: Path, output_dir: Path, **changes: object) -> VqVaeTrain
     config = preset("cpu", root, output_dir)
     values: dict[str, object] = {
         "model": TINY,
-        "updates": 80,
-        "validate_every": 20,
+        "updates": 160,
+        "validate_every": 40,
         "batch_size": 16,
         "lr": 5e-3,
         "validation_share": 0.25,

@@ -18,8 +18,8 @@ class VqVaeConfig:
     """Of the first two convolutions; the paper does not give them."""
     latent_channels: int = 3
     """Components of a code, and channels of the last convolution (the paper's 3 x 6 x 6)."""
-    codes: int = 512
-    """K, the size of the codebook (van den Oord et al. 2017); the paper does not give it."""
+    codes: int = 1024
+    """K, the size of the codebook; the paper does not give it."""
     commitment: float = 0.25
     """Weight of the commitment loss (beta of van den Oord et al. 2017)."""
     decay: float = 0.99
@@ -57,7 +57,7 @@ class VqVaeTrainConfig:
     output_dir: Path
     """Where the run goes."""
     model: VqVaeConfig = field(default_factory=VqVaeConfig)
-    updates: int = 8_000
+    updates: int = 12_000
     batch_size: int = 256
     lr: float = 1e-3
     """Of Adam at the start."""

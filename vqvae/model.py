@@ -51,7 +51,7 @@ class VqVae(nn.Module):
             nn.ReLU(inplace=True),
             Double(first, 3),
         )
-        self.register_buffer("mean", torch.zeros(3, 1, 1))
+        self.register_buffer("mean", torch.zeros(3, *config.image_size))
         self.register_buffer("std", torch.ones(3, 1, 1))
         self.register_buffer("unit", torch.ones(()))
 
@@ -119,8 +119,9 @@ class VqVae(nn.Module):
         return digest.hexdigest()[:16]
 
     def set_moments(self, mean: Tensor, std: Tensor) -> None:
-        """Set what images are standardised with: (3,) mean and deviation of pixels in 0..1."""
-        self.mean.copy_(mean.view(3, 1, 1))
+        """Set what images are standardised with: the mean image (H, W, 3), so that codes are spent
+        on what changes, and the deviation (3,) of each colour from it, of pixels in 0..1."""
+        self.mean.copy_(mean.permute(2, 0, 1))
         self.std.copy_(std.clamp(min=_LEAST_STD).view(3, 1, 1))
 
 

@@ -161,6 +161,8 @@ def spread(rows: np.ndarray, count: int) -> np.ndarray:
 
 
 def moments(images: np.ndarray) -> tuple[Tensor, Tensor]:
-    """Return mean and deviation (3,) of the pixels of (N, H, W, 3) uint8 images, in 0..1."""
-    pixels = images.reshape(-1, 3).astype(np.float32) / 255.0
-    return torch.from_numpy(pixels.mean(0)), torch.from_numpy(pixels.std(0))
+    """Return the mean (H, W, 3) of (N, H, W, 3) uint8 images, in 0..1, and how far each colour
+    deviates from it, (3,)."""
+    pixels = images.astype(np.float32) / 255.0
+    mean = pixels.mean(0)
+    return torch.from_numpy(mean), torch.from_numpy((pixels - mean).std((0, 1, 2)))
