@@ -82,6 +82,17 @@ class Grip:
         refined[1, 3] = 0.0
         self.transform_block_to_tool, self._variance = refined, (np.eye(3) - gain) @ before
 
+    def slip(self, up_m: float, tool: np.ndarray) -> None:
+        """Note that something from below has shifted it by so much in the fingers of a (4, 4) tool.
+
+        By how much exactly, images have to tell.
+        """
+        shift = up_m * tool[2, :3]
+        shifted = self.transform_block_to_tool.copy()
+        shifted[:3, 3] += shift
+        self.transform_block_to_tool = shifted
+        self._variance = self._variance + np.diag(shift**2)
+
     def _tool(self, time_s: float, tool_then: np.ndarray) -> np.ndarray:
         """Return where the tool was, or where it was to be once it held the block."""
         begun = self._begun

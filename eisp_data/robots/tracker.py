@@ -30,6 +30,8 @@ _FLYING_PX = 0.35
 _ANY_TILT_STD = 0.5
 """Of one that does not: it only says which of two mirror images it is."""
 _HELD_TILT_STD = 0.1
+_UPRIGHT = 0.995
+"""Cosine of the tilt from which on a block is on its way from one face to another."""
 _STANDS_M, _STANDS_STD = 0.006, 3.0
 """How far off its place a standing block may seem: so far, and so many standard deviations."""
 _STOOD_M = 0.003
@@ -186,7 +188,8 @@ class Tracker:
         """Return the block's pose, with what is known of one that is held or stands."""
         item = self._marked[name]
         if block.held and guess is not None:
-            return fit_pose(self._view, item, rays, guess, Priors(_HELD_TILT_STD))
+            held = fit_pose(self._view, item, rays, guess, Priors(_HELD_TILT_STD))
+            return None if held is None or _on_another_face(held, guess) else held
         if guess is not None:
             unmoved = self._stand_as_before(name, guess, rays)
             if unmoved is not None:
@@ -196,7 +199,8 @@ class Tracker:
             tilted = fit_pose(self._view, item, rays, guess, Priors(_ANY_TILT_STD))
             # Freedom to tilt makes up for wrong corners, too: it has to explain much.
             if fit is None or (tilted is not None and tilted.error_px < 0.5 * fit.error_px):
-                return None if tilted is None or _is_sunk(tilted) else tilted
+                doubtful = tilted is None or _is_sunk(tilted) or _is_mirrored(tilted, guess)
+                return None if doubtful else tilted
         standing = self._stand(name, fit, rays)
         if standing is not None:
             return standing
@@ -283,3 +287,22 @@ def _is_sunk(fit: PoseFit) -> bool:
     So it seems where the arm covers a half of the only marker in sight.
     """
     return bool(fit.transform_object_to_task[2, 3] < HALF_M - _STANDS_M)
+
+
+def _is_mirrored(fit: PoseFit, guess: np.ndarray | None) -> bool:
+    """Whether a block would stand askew on another face than before.
+
+    So it seems where the outline of the only marker in sight is wrong: of the two poses that it may
+    have, the false one then fits better. From the camera a front that is a little off looks like a
+    top that leans back.
+    """
+    if guess is None or not _on_another_face(fit, guess):
+        return False
+    return bool(np.abs(fit.transform_object_to_task[2, :3]).max() < _UPRIGHT)
+
+
+def _on_another_face(fit: PoseFit, guess: np.ndarray) -> bool:
+    """Whether another of a block's faces is up than in the guess (4, 4); in the fingers none is."""
+    now, before = fit.transform_object_to_task[2, :3], guess[2, :3]
+    face = np.abs(now).argmax()
+    return bool(face != np.abs(before).argmax() or now[face] * before[face] < 0.0)

@@ -105,7 +105,7 @@ class BlockTrack:
             before: the state before.
             tool: the newest state.
             standing_m: returns the height at which the block would stand if it is let go of at a
-                pose (4, 4).
+                pose (4, 4), or does if it is no higher.
         """
         if self.pose is None:
             return
@@ -117,6 +117,11 @@ class BlockTrack:
                 self._let_go(self._grip, moment, standing_m)
         if self._grip is not None:
             self.pose = tool.transform_tool_to_task @ self._grip.transform_block_to_tool
+            sunk_m = standing_m(self.pose) - self.pose[2, 3]
+            if sunk_m > 0.0:
+                # Fingers that go on down slide along a block that stands.
+                self._grip.slip(sunk_m, tool.transform_tool_to_task)
+                self.pose[2, 3] += sunk_m
             self.velocity, self.spin = _velocity_at(self.pose, tool), tool.spin
 
     def _go_on_alone(self, before: ToolState, tool: ToolState) -> None:
