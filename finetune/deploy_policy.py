@@ -24,6 +24,8 @@ _HIDDEN_STEPS = 5
 """What is at its goal but has been out of sight for so long is looked at: it may be gone."""
 _DONE_STEPS = 3
 """It has done with them once that has been so for so many steps."""
+_TAKEN_M = 0.03
+"""An object that moves so far within a step while the arm is clear of it was moved by somebody."""
 _STALLED_STEPS, _STILL_M = 40, 0.025
 """A policy that for so many steps has moved neither the arm nor an object further has come to a
 standstill, or goes to and fro between two subgoals."""
@@ -71,7 +73,8 @@ class Looking:
     """Asks for a look at the table after each subgoal, once the arm has let go and come away.
 
     Where the look shows something else than was believed, the policy plans anew. It does so, too,
-    after a look that was asked for because nothing went on.
+    as soon as somebody moves an object, and after a look that was asked for because nothing went
+    on.
     """
 
     def __init__(self, inner: PolicyController, task: Task) -> None:
@@ -82,10 +85,11 @@ class Looking:
         self._believed: np.ndarray | None = None
         self._places: np.ndarray = np.empty(0)
         self._still = 0
+        self._last: np.ndarray | None = None
 
     def begin(self, seen: Seen, goal: np.ndarray, seed: int) -> None:
         """Start an episode."""
-        self._due, self._goal, self._believed = False, goal, None
+        self._due, self._goal, self._believed, self._last = False, goal, None, None
         self._done = self._since = self._clung = self._hidden = self._still = 0
         self._inner.begin(seen, goal, seed)
 
@@ -95,6 +99,8 @@ class Looking:
             if np.abs(seen.achieved_goal - self._believed).max() > _SURPRISE_M:
                 self._inner.replan()
             self._believed = None
+        if self._is_taken(seen):
+            self._inner.replan()
         decision = self._inner.act(seen)
         self._since += 1
         self._due |= self._inner.at_subgoal and self._since >= _SHORTEST_STEPS
@@ -115,10 +121,20 @@ class Looking:
             return decision
         if clings or stalls:
             self._inner.replan()
-        self._due = False
+        self._due, self._last = False, None
         self._since = self._clung = self._hidden = self._still = 0
         self._believed = seen.achieved_goal.copy()
         return Decision(np.zeros(4), looking=True)
+
+    def _is_taken(self, seen: Seen) -> bool:
+        """Return whether somebody has moved an object since the last step."""
+        places = seen.achieved_goal.reshape(-1, 3)
+        before, self._last = self._last, places
+        if before is None:
+            return False
+        moved = np.linalg.norm(places - before, axis=1) > _TAKEN_M
+        clear = np.linalg.norm(before - seen.gripper_m, axis=1) > _CLEAR_M
+        return bool((moved & clear).any())
 
     def _stalls(self, seen: Seen) -> bool:
         """Return whether arm and objects have stayed where they are for too long."""

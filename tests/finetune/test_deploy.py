@@ -127,9 +127,27 @@ def test_the_policy_plans_anew_where_a_look_shows_something_else_than_was_believ
     inner.at_subgoal = True
     while not looking.act(now).looking:
         assert inner.replanned == 0 and len(inner.shown) < 50
-    looking.act(replace(now, achieved_goal=now.achieved_goal + moved_m))
-    looking.act(now)
+    shown = replace(now, achieved_goal=now.achieved_goal + moved_m)
+    looking.act(shown)
+    looking.act(shown)
     assert inner.replanned == replans
+
+
+def test_the_policy_plans_anew_as_soon_as_somebody_moves_a_block() -> None:
+    inner = Inner()
+    looking = Looking(inner, STACK)
+    now = seen_at(np.array([0.3, 0.0, 0.2]), 2 * FINGER_TRAVEL_M)
+    looking.begin(now, np.zeros(9), 0)
+    looking.act(now)
+    moved = now.achieved_goal.copy()
+    moved[4] += 0.2
+    looking.act(replace(now, achieved_goal=moved))
+    assert inner.replanned == 1
+    # What the arm moves itself is no surprise.
+    held = seen_at(moved.reshape(-1, 3)[1], BLOCK_SIZE_M)
+    looking.act(replace(held, achieved_goal=moved))
+    looking.act(replace(held, achieved_goal=now.achieved_goal))
+    assert inner.replanned == 1
 
 
 def test_what_is_at_its_goal_and_held_there_is_let_go_of() -> None:
