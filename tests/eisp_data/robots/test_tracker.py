@@ -9,11 +9,13 @@ import pytest
 
 from eisp_data.errors import RobotError
 from eisp_data.robots import cell
+from eisp_data.robots.aruco import Detections
 from eisp_data.robots.estimates import Estimates, ObjectEstimate, upright
 from eisp_data.robots.kinematics import kinematics
 from eisp_data.robots.loop import POLLS
-from eisp_data.robots.pose import PoseFit
-from eisp_data.robots.robot import JointCommand, Reading
+from eisp_data.robots.markers import marked_objects
+from eisp_data.robots.pose import PoseFit, View
+from eisp_data.robots.robot import CameraFrame, JointCommand, Reading
 from eisp_data.robots.session_view import seen
 from eisp_data.robots.tool_history import ToolHistory, ToolState
 from eisp_data.robots.tracker import Tracker
@@ -290,6 +292,47 @@ def test_a_hold_begins_and_ends_between_two_readings_where_the_fingers_meet_the_
     track.follow(later, moving(0.35, 0.10, 0.08), on_the_table)
     np.testing.assert_allclose(track.pose[1:3, 3], [0.0, 0.025], atol=1e-9)
     assert 0.305 < track.pose[0, 3] < 0.312
+
+
+def test_a_held_block_that_is_pressed_on_the_table_slides_up_in_the_fingers():
+    track = BlockTrack()
+    track.see(fit_at([0.3, 0.0, 0.025]), 0.0, FAR, [])
+    tools = [tool_at(0.04 * i, [0.3, 0.0, z], 0.05) for i, z in enumerate([0.03, 0.02, 0.06])]
+    for before, tool, expected in zip(tools, tools[1:], [0.025, 0.065], strict=False):
+        track.follow(before, before, on_the_table)
+        track.follow(before, tool, on_the_table)
+        assert track.held and track.pose is not None
+        assert track.pose[2, 3] == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_front_whose_outline_is_wrong_is_not_taken_for_a_top_that_leans_back():
+    """The corners are those that were found in an image, one of them the block's own."""
+    found = np.array([[243.6, 243.5], [289.0, 244.0], [295.0, 273.0], [246.3, 271.4]])
+    with TwinRobot("stack", seed=0) as robot:
+        tracker = Tracker(get_task("stack"), robot.calibration, CAMERA, "ur3")
+        front = marked_objects(get_task("stack"))["block0"].markers[2]
+        place = cell.transform(np.eye(3), np.array([0.298, -0.047, 0.025]))
+        view = View(robot.calibration.cameras[CAMERA], robot.calibration.transform_base_to_task)
+        right = view.project(cell.apply(place, front.corners()))
+        assert np.linalg.norm(found - right, axis=1).max() > 2.0
+        shown = Shown(front.number, right)
+        tracker._detector = shown
+        for number in range(8):
+            shown.corners = right if number < 4 else found
+            frame = CameraFrame(np.zeros((480, 640, 3), np.uint8), robot.now_s(), number)
+            believed = tracker.update(robot.observe(), frame).objects["block0"]
+            robot.wait_until(robot.now_s() + TICK_S)
+            assert np.linalg.norm(believed.transform_object_to_task[:3, 3] - place[:3, 3]) < 0.01
+
+
+class Shown:
+    """Finds one marker, where it is told to."""
+
+    def __init__(self, number: int, corners: np.ndarray) -> None:
+        self.number, self.corners = number, corners
+
+    def detect(self, image: np.ndarray) -> Detections:
+        return Detections(np.array([self.number]), self.corners[None])
 
 
 def test_an_image_is_laid_on_where_the_tool_was_then():
