@@ -116,6 +116,31 @@ class CartesianServo:
         pose[:3, 3] += self._placed[:3, :3] @ (inside - here)
         return self._kinematics.track(pose, joint_position)
 
+    def force(self, joint_position: np.ndarray, joint_effort: np.ndarray) -> np.ndarray:
+        """Return the force (3,) N, task's frame, with which a slow arm of (J,) N m presses."""
+        jacobian = self._kinematics.jacobian(joint_position)
+        wrench = np.linalg.lstsq(jacobian.T, joint_effort, rcond=0.01)[0]
+        return self._placed[:3, :3].T @ wrench[:3]
+
+    def held_back(
+        self, wanted: np.ndarray, sent: np.ndarray, direction: np.ndarray, most_m: float
+    ) -> np.ndarray:
+        """Return the targets (J,) rad that go no further than so far in a direction.
+
+        Args:
+            wanted: (J,) rad, where the arm would go.
+            sent: (J,) rad, from where.
+            direction: (3,), of length 1, in the task's frame.
+            most_m: how far it may go that way; below 0 it has to go back.
+        """
+        pose = self._kinematics.forward(wanted)
+        way = self._to_task(pose[:3, 3]) - self.tool_in_task(sent)
+        excess = float(way @ direction) - most_m
+        if excess <= 0.0:
+            return wanted
+        pose[:3, 3] -= self._placed[:3, :3] @ (excess * direction)
+        return self._kinematics.track(pose, sent)
+
     def _to_task(self, point: np.ndarray) -> np.ndarray:
         """Return a point (3,) of the base's frame in the task's."""
         return self._placed[:3, :3].T @ (point - self._placed[:3, 3])

@@ -8,7 +8,12 @@ from eisp_data.robots.motion import CartesianServo
 from eisp_data.robots.robot import JointCommand, Reading, Robot
 
 _YIELD_SHARE = 0.6
-"""Of a joint's greatest torque. In training 60 N was the most that the gripper could push with."""
+"""Of a joint's greatest torque: more than any motion in the air takes."""
+_MOST_N, _GONE_N = 60.0, 15.0
+"""In training 60 N was the most that the gripper could push with. With less than the other there is
+no contact any more."""
+_STIFFNESS_N_M = 40e3
+"""Of the arm's servos, at the tool: measured in the twin, pressing on a block."""
 
 
 class Mover:
@@ -23,10 +28,13 @@ class Mover:
         self.servo = servo
         self._robot = robot
         self._sent: np.ndarray | None = None
+        self._against: np.ndarray | None = None
+        self._strained = False
 
     def start(self) -> None:
         """Begin from an arm at rest."""
-        self._sent = None
+        self._sent = self._against = None
+        self._strained = False
         self.servo.start()
 
     def send(self, action: np.ndarray, reading: Reading) -> JointCommand:
@@ -40,10 +48,36 @@ class Mover:
             self._sent = reading.joint_position
         wanted = self.servo.step(action, self._sent)
         if reading.joint_effort is not None:
-            share = np.abs(reading.joint_effort) / self._robot.limits.effort
-            if share.max() > _YIELD_SHARE:
-                there = self.servo.give_way(reading.joint_position)
-                wanted = JointCommand(there, wanted.gripper_opening_m)
+            there = self._give_way(wanted.joint_position, self._sent, reading, reading.joint_effort)
+            wanted = JointCommand(there, wanted.gripper_opening_m)
         command = self._robot.command(wanted)
         self._sent = command.joint_position
         return command
+
+    def _give_way(
+        self, wanted: np.ndarray, sent: np.ndarray, reading: Reading, effort: np.ndarray
+    ) -> np.ndarray:
+        """Return the targets (J,) rad that press with no more force than in training.
+
+        What presses is held back in the direction of its force alone: an arm that took for its
+        place where it was pressed to would wander off sideways, for it is not as stiff one way as
+        another, and drag along what it presses on. One that is strained in spite of that is wedged,
+        and gives way altogether.
+        """
+        here = reading.joint_position
+        strained = bool((np.abs(effort) / self._robot.limits.effort).max() > _YIELD_SHARE)
+        before, self._strained = self._strained, strained
+        if strained and before:
+            return self.servo.give_way(here)
+        if not strained and self._against is None:
+            return wanted
+        force = self.servo.force(here, effort)
+        if strained:
+            self._against = force / np.linalg.norm(force)
+        assert self._against is not None
+        pressing_n = float(force @ self._against)
+        if pressing_n < _GONE_N:
+            self._against = None
+            return wanted
+        most_m = (_MOST_N - pressing_n) / _STIFFNESS_N_M
+        return self.servo.held_back(wanted, sent, self._against, most_m)
