@@ -12,10 +12,16 @@ from torch import Tensor, nn
 
 from pretrain.layout import Layout
 
-_LENGTH_SCALE = 10.0
+_LENGTH = 10.0
 """Ten per metre: the table's decimetres become units."""
-_SPEED_SCALE = 2.0
-_SPIN_SCALE = 0.2
+_SPEED = 2.0
+_SPIN = 0.2
+_ROBOT_CENTRE = [0.31, 0.0, 0.1, *[0.0] * 7]
+_ROBOT_SCALE = [*[_LENGTH] * 3, *[4 * _LENGTH] * 2, *[_SPEED] * 3, *[2 * _SPEED] * 2]
+"""Of place, fingers, velocity and the fingers' velocities."""
+_OBJECT_CENTRE = [0.31, 0.0, 0.05, *[0.0] * 12]
+_OBJECT_SCALE = [*[_LENGTH] * 6, *[1.0] * 3, *[_SPEED] * 3, *[_SPIN] * 3]
+"""Of place, place from the gripper, Euler angles, velocity and spin."""
 
 
 class PlainFeatures(nn.Module):
@@ -62,14 +68,14 @@ class ObjectFeatures(nn.Module):
         focus = way.argmax(1)
         if self._interchangeable:
             position = tokens[..., _POSITION]
-            anchor = position[torch.arange(len(focus)), focus]
-            apart = (position - anchor[:, None]).norm(dim=-1)
+            anchor = position.gather(1, focus[:, None, None].expand(-1, 1, 3))
+            apart = (position - anchor).norm(dim=-1)
             apart.scatter_(1, focus[:, None], -1.0)
             order = apart.argsort(1)
             tokens = tokens.gather(1, order[..., None].expand(-1, -1, tokens.shape[-1]))
             extra = []
         else:
-            extra = [nn.functional.one_hot(focus, tokens.shape[1]).to(tokens.dtype)]
+            extra = [torch.zeros_like(way).scatter_(1, focus[:, None], 1.0)]
         position = tokens[..., _POSITION]
         target = position[:, :1] + tokens[:, :1, _WAY]
         others = [position[:, 1:] - position[:, :1], position[:, 1:] - target]
@@ -83,17 +89,7 @@ _WAY = slice(6, 9)
 
 def scaled_robot(robot: Tensor) -> Tensor:
     """Return the (B, 10) gripper features in the networks' units."""
-    position, fingers, velocity, finger_velocity = robot.split([3, 2, 3, 2], -1)
-    centred = position - position.new_tensor([0.31, 0.0, 0.1])
-    return torch.cat(
-        [
-            centred * _LENGTH_SCALE,
-            fingers * 4 * _LENGTH_SCALE,
-            velocity * _SPEED_SCALE,
-            finger_velocity * 2 * _SPEED_SCALE,
-        ],
-        -1,
-    )
+    return (robot - robot.new_tensor(_ROBOT_CENTRE)) * robot.new_tensor(_ROBOT_SCALE)
 
 
 def object_tokens(layout: Layout, observation: Tensor, goal: Tensor) -> Tensor:
@@ -102,24 +98,13 @@ def object_tokens(layout: Layout, observation: Tensor, goal: Tensor) -> Tensor:
     A cube looks the same after a quarter turn, so the yaw enters as the sine and cosine of four
     times itself; the last feature tells how long the way is.
     """
-    starts = torch.tensor([item.observation for item in layout.objects])
-    features = observation[:, starts[:, None] + torch.arange(15)]
-    position, relative, euler, velocity, spin = features.split(3, -1)
-    goals = goal[:, torch.tensor([item.goal for item in layout.objects])[:, None] + torch.arange(3)]
-    way = (goals - position) * _LENGTH_SCALE
-    quarter = 4 * euler[..., 2:]
-    centred = position - position.new_tensor([0.31, 0.0, 0.05])
-    return torch.cat(
-        [
-            centred * _LENGTH_SCALE,
-            relative * _LENGTH_SCALE,
-            way,
-            euler[..., :2].clamp(-1, 1),
-            quarter.sin(),
-            quarter.cos(),
-            velocity * _SPEED_SCALE,
-            spin * _SPIN_SCALE,
-            way.norm(dim=-1, keepdim=True),
-        ],
-        -1,
-    ).clamp(-10, 10)
+    objects = layout.objects
+    seen = torch.stack([observation[:, i.observation : i.observation + 15] for i in objects], 1)
+    goals = torch.stack([goal[:, i.goal : i.goal + 3] for i in objects], 1)
+    way = (goals - seen[..., :3]) * _LENGTH
+    quarter = 4 * seen[..., 8:9]
+    scaled = (seen - seen.new_tensor(_OBJECT_CENTRE)) * seen.new_tensor(_OBJECT_SCALE)
+    tilt, rest = scaled[..., 6:8].clamp(-1, 1), scaled[..., 9:]
+    length = way.norm(dim=-1, keepdim=True)
+    parts = [scaled[..., :6], way, tilt, quarter.sin(), quarter.cos(), rest, length]
+    return torch.cat(parts, -1).clamp(-10, 10)
