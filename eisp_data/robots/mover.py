@@ -11,7 +11,11 @@ _YIELD_SHARE = 0.6
 """Of a joint's greatest torque: more than any motion in the air takes."""
 _MOST_N, _GONE_N = 60.0, 15.0
 """In training 60 N was the most that the gripper could push with. With less than the other there is
-no contact any more."""
+no contact any more;"""
+_GENTLE_TICKS = 12
+"""but for so long it comes near only slowly: it would strike again and again."""
+_WEDGED_TICKS = 1
+"""What has strained for so many ticks, although it was held back, is wedged."""
 _STIFFNESS_N_M = 40e3
 """Of the arm's servos, at the tool: measured in the twin, pressing on a block."""
 
@@ -29,12 +33,12 @@ class Mover:
         self._robot = robot
         self._sent: np.ndarray | None = None
         self._against: np.ndarray | None = None
-        self._strained = False
+        self._strained = self._gentle = 0
 
     def start(self) -> None:
         """Begin from an arm at rest."""
         self._sent = self._against = None
-        self._strained = False
+        self._strained = self._gentle = 0
         self.servo.start()
 
     def send(self, action: np.ndarray, reading: Reading) -> JointCommand:
@@ -66,8 +70,8 @@ class Mover:
         """
         here = reading.joint_position
         strained = bool((np.abs(effort) / self._robot.limits.effort).max() > _YIELD_SHARE)
-        before, self._strained = self._strained, strained
-        if strained and before:
+        self._strained = self._strained + 1 if strained else 0
+        if self._strained > _WEDGED_TICKS:
             return self.servo.give_way(here)
         if not strained and self._against is None:
             return wanted
@@ -76,8 +80,12 @@ class Mover:
             self._against = force / np.linalg.norm(force)
         assert self._against is not None
         pressing_n = float(force @ self._against)
-        if pressing_n < _GONE_N:
+        self._gentle = _GENTLE_TICKS if pressing_n > _GONE_N else self._gentle - 1
+        if not self._gentle:
             self._against = None
             return wanted
         most_m = (_MOST_N - pressing_n) / _STIFFNESS_N_M
+        if strained:
+            pressed_m = self.servo.tool_in_task(sent) - self.servo.tool_in_task(here)
+            most_m = -max(0.0, float(pressed_m @ self._against))
         return self.servo.held_back(wanted, sent, self._against, most_m)

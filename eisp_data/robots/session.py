@@ -21,7 +21,7 @@ from eisp_data.storage.mcap.build import GOAL, REACHED, STATE, WORLD
 from eisp_data.tasks.base import GRIPPER_DIM, is_success
 
 _MET_TICKS = 12
-"""An episode is a success once its goal has been met for half a second."""
+"""An episode is a success once its goal has been seen to be met for half a second."""
 _UNSEEN_TICKS = 150
 """What is out of sight has to have met it for so long: somebody may have taken it away."""
 _STAND_TICKS = 8
@@ -124,7 +124,7 @@ class Session:
         ticks = self.ticks.run(self._poll)
         if self._eyes.missing() and not self._look_first(ticks):
             return Ended("", 0, float("nan"), 0)
-        met = 0
+        met = met_in_sight = 0
         for step, at_ns in enumerate(ticks):
             self._at_ns = at_ns
             seen = self._eyes.see(at_ns / 1e9, self._log.reading)
@@ -132,7 +132,9 @@ class Session:
                 self._begin(controller, seen, seed, at_ns)
             self._record(seen, at_ns)
             met = met + 1 if self._is_met(seen) else 0
-            sure = met >= (_MET_TICKS if seen.age_s < FRESH_S else _UNSEEN_TICKS)
+            # What comes into sight again where it was believed may be on its way elsewhere.
+            met_in_sight = met_in_sight + 1 if met and seen.age_s < FRESH_S else 0
+            sure = met_in_sight >= _MET_TICKS or met >= _UNSEEN_TICKS
             ending = self._ending(step, most_ticks, sure)
             if ending is not None:
                 return self._ended(ending, step, seen)

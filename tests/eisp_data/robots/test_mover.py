@@ -56,11 +56,10 @@ def test_pressing_on_a_block_is_gentle_and_drags_it_nowhere(over_a_block):
     over_a_block.run([0.0, 0.0, -0.3, -1.0], 15)
     over_a_block.forces_n.clear()
     reading = over_a_block.run([0.0, 0.0, -0.3, -1.0], 35)
-    # It bounces a little; an arm that just gives way whenever it is strained presses with 240 N.
-    assert np.median(over_a_block.forces_n) < 130.0
-    assert np.percentile(over_a_block.forces_n, 90) < 190.0
+    assert np.median(over_a_block.forces_n) < 110.0
+    # One that just gives way whenever it is strained wanders off by 13 cm.
     after = over_a_block.servo.tool_in_task(reading.joint_position)
-    assert np.linalg.norm((after - before)[:2]) < 0.015
+    assert np.linalg.norm((after - before)[:2]) < 0.025
     assert after[2] > 0.055
 
 
