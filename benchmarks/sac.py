@@ -9,8 +9,9 @@ natively, and in fp32. Our settings let oneDNN multiply fp32 instead of MKL, whi
 on an AMD processor. Stable-Baselines3 is timed as it comes and with that setting. On a processor
 without AMX the products stay fp32 by it: their error is printed. All take short turns one after the
 other, so that whatever else the machine does meets them alike; the rates are over the sums of the
-turns. The limit is the arithmetic of one update at the rate at which oneDNN multiplies matrices of
-that size, fp32, on the same threads.
+turns. Processor time, with ``--threads 1``, can be compared on a busy machine too. The limit is the
+arithmetic of one update at the rate at which oneDNN multiplies matrices of that size, fp32, on the
+same threads.
 """
 
 from __future__ import annotations
@@ -218,12 +219,13 @@ def compare(options: Options, layers: tuple[int, ...]) -> None:
     for learner in learners.values():
         learner.update(options.turn_updates)
     ours.sampling_s = 0.0
-    spent = dict.fromkeys(learners, 0.0)
+    spent, processor = dict.fromkeys(learners, 0.0), dict.fromkeys(learners, 0.0)
     for _ in range(options.turns):
         for name, learner in learners.items():
-            start = time.perf_counter()
+            start, used = time.perf_counter(), time.process_time()
             learner.update(options.turn_updates)
             spent[name] += time.perf_counter() - start
+            processor[name] += time.process_time() - used
     updates = options.turns * options.turn_updates
     bound, error = limit(options, layers)
     print(f"{layers[0]} x {len(layers)}, batch {options.batch_size}, {options.threads} threads")
@@ -231,7 +233,8 @@ def compare(options: Options, layers: tuple[int, ...]) -> None:
         rate = updates / seconds
         bf16, fp32 = seconds / spent["ours"], seconds / spent["ours, fp32"]
         print(
-            f"  {name:18s} {rate:6.1f} updates/s; ours {bf16:4.2f} times as fast, fp32 {fp32:4.2f}"
+            f"  {name:18s} {rate:6.1f} updates/s; ours {bf16:4.2f} times as fast, fp32 {fp32:4.2f};"
+            f" {1e3 * processor[name] / updates:5.1f} ms of processor time"
         )
     print(
         f"  {'arithmetic limit':18s} {bound:6.1f} updates/s, fp32; error of a product {error:.0e}"
