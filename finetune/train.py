@@ -143,9 +143,11 @@ class Finetuner:
         self._rng = np.random.default_rng(seed)
         torch.manual_seed(seed)
         self._offline = offline
-        self._online = Trajectories(
-            agent.layout, config.replay_size, agent.config.waypoints, purposeful=False
-        )
+        parts = agent.config.waypoints
+        if agent.vision and parts is None:
+            # What is at rest is known of demonstrations; in an image the gripper always moves.
+            parts = max(1, config.round_steps // agent.config.subgoals.every_steps)
+        self._online = Trajectories(agent.layout, config.replay_size, parts, purposeful=False)
         self._learner = Learner(agent, config.lr, config.generator_lr, threads)
         worlds = make_worlds(config.worlds)
         if worlds.episode_steps % config.round_steps:

@@ -12,7 +12,7 @@ from typing import Literal
 
 from eisp_data.errors import ConfigError
 from eisp_data.tasks.base import SUCCESS_DISTANCE_M
-from eisp_data.tasks.images import image_task, state_task
+from eisp_data.tasks.images import image_task
 from eisp_data.tasks.registry import TASKS
 from pretrain.config import (
     AgentConfig,
@@ -126,19 +126,20 @@ def _paper(task: str, root: Path, output_dir: Path) -> PretrainConfig:
 
 
 def _cpu_image(config: PretrainConfig) -> PretrainConfig:
-    agent, table = config.agent, TASKS[state_task(config.agent.task)].paper
+    agent = config.agent
     return replace(
         config,
         agent=replace(
             agent,
             features="plain",
             generator="hybrid",
-            # In an image something moves at all times: the gripper.
-            waypoints=table.waypoints,
             # Beside the divergence of 108 components the paper's beta leaves nothing of L_HS.
             hybrid=HybridConfig(beta=_BETA),
             subgoals=SubgoalConfig(
-                candidates=1, every_steps=_IMAGE_SUBGOAL_STEPS, reached_m=SUCCESS_DISTANCE_M
+                candidates=1,
+                every_steps=_IMAGE_SUBGOAL_STEPS,
+                reached_m=SUCCESS_DISTANCE_M,
+                direct_steps=_IMAGE_DIRECT_STEPS,
             ),
             mix=GoalMix(waypoint=0.5, future=0.5, displaced=0.0),
         ),
@@ -147,7 +148,9 @@ def _cpu_image(config: PretrainConfig) -> PretrainConfig:
 
 
 _IMAGE_SUBGOAL_STEPS = 20
-"""About as far apart as the waypoints of a demonstration."""
+"""As online, where the waypoints are as far apart."""
+_IMAGE_DIRECT_STEPS = 50
+"""Goals up to 40 steps away are learned from (``GoalMix.horizon``); some further are reached."""
 _PAPER_IMAGE_GENERATOR_LR = 3e-5
 """Appendix "Image-based observation processing", as the batch, which is that of Table I."""
 

@@ -6,7 +6,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from eisp_data.tasks.base import SUCCESS_DISTANCE_M
 from pretrain.config import GoalMix
 from pretrain.hindsight import Waypoints, find_waypoints
 from pretrain.layout import Layout
@@ -39,6 +38,7 @@ class Trajectories:
         self.achieved_goal = np.empty((0, layout.goal_dim), np.float32)
         self.action = np.empty((0, layout.action_dim), np.float32)
         self.pursued = np.empty((0, layout.goal_dim), np.float32)
+        self._success = np.empty(0, bool)
         self.episode_start = np.zeros(1, np.int64)
         self.waypoints = Waypoints(*(np.empty(0, np.int64) for _ in range(3)))
         self._index()
@@ -53,11 +53,20 @@ class Trajectories:
         action: np.ndarray,
         pursued: np.ndarray,
         episode_start: np.ndarray,
+        places: np.ndarray | None = None,
+        success: np.ndarray | None = None,
     ) -> None:
-        """Append whole episodes: rows (R, ...) and their (E + 1,) starts.
+        """Append whole episodes.
 
-        ``pursued`` are the goals (R, G) that the actions were meant for: the subgoals of a
-        rollout, the final goal of a demonstration.
+        Args:
+            observation: (R, S).
+            achieved_goal: (R, G).
+            action: (R, A).
+            pursued: (R, G), the goals that the actions were meant for: the subgoals of a rollout,
+                the final goal of a demonstration.
+            episode_start: (E + 1,).
+            places: (R, P) where the objects were, metres, if the achieved goals do not say it.
+            success: (R,) bool, whether a demonstration's own goal is met; needed of these alone.
         """
         starts = np.concatenate([self.episode_start, len(self) + np.asarray(episode_start[1:])])
         first = int(np.searchsorted(starts, starts[-1] - self._capacity))
@@ -66,8 +75,11 @@ class Trajectories:
         self.achieved_goal = np.concatenate([self.achieved_goal, achieved_goal])[cut:]
         self.action = np.concatenate([self.action, action])[cut:]
         self.pursued = np.concatenate([self.pursued, pursued])[cut:]
+        met = np.zeros(len(observation), bool) if success is None else success
+        self._success = np.concatenate([self._success, met])[cut:]
         self.episode_start = starts[first:] - cut
-        added = find_waypoints(achieved_goal, np.asarray(episode_start), self._parts)
+        moving = achieved_goal if places is None else places
+        added = find_waypoints(moving, np.asarray(episode_start), self._parts)
         self.waypoints = self.waypoints.joined(added).without_first(cut)
         self._index()
 
@@ -79,17 +91,12 @@ class Trajectories:
         self.leading = self.acting[self.waypoints.following[self.acting] >= 0]
         """Rows that have a waypoint after them."""
         self._guiding = self.acting if self._purposeful else self.leading
-        self._complete = self._meeting_their_own_goal() if self._purposeful else self.leading[:0]
+        self._complete = self.leading[self._success[self.waypoints.furthest(self.leading)]]
+        """Rows of ``leading`` after which a demonstration's own goal is met at rest."""
         self._next_rest = self._last.copy()
         ahead = self.waypoints.following >= 0
         self._next_rest[ahead] = self.waypoints.row[self.waypoints.following[ahead]]
         """For each row the next waypoint, or where there is none the end of the episode."""
-
-    def _meeting_their_own_goal(self) -> np.ndarray:
-        """Return the rows of ``leading`` after which the goal that was pursued is met at rest."""
-        ends = self.waypoints.furthest(self.leading)
-        missed = np.linalg.norm(self.achieved_goal[ends] - self.pursued[self.leading], axis=1)
-        return self.leading[missed <= SUCCESS_DISTANCE_M]
 
     def transitions(self, count: int, mix: GoalMix, rng: np.random.Generator) -> Batch:
         """Draw transitions with goals relabelled as the mix says."""

@@ -157,5 +157,7 @@ def gather(
         arrays.action[rows],
         np.repeat(arrays.desired_goal[episodes], lengths, axis=0),
         np.concatenate([[0], np.cumsum(lengths)]),
+        None if arrays.places is None else arrays.places[rows],
+        arrays.success[rows],
     )
     return data

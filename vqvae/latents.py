@@ -108,6 +108,7 @@ def load_latent_arrays(root: Path, model: VqVae, config: VisionConfig) -> Datase
         observation=np.hstack([proprio, latents]),
         achieved_goal=latents,
         desired_goal=embed(model, goals),
+        places=arrays.achieved_goal,
     )
 
 

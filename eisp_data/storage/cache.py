@@ -65,6 +65,8 @@ class DatasetArrays:
     """(E,) int64."""
     info: list[dict[str, Scalar]]
     """Each episode's info."""
+    places: np.ndarray | None = None
+    """(R, P) float32, m: where the objects were, if the goals have been replaced by images."""
 
     @property
     def num_episodes(self) -> int:
@@ -77,7 +79,9 @@ class DatasetArrays:
         return len(self.reward) - len(self.seed)
 
 
-ARRAYS = tuple(name for name in DatasetArrays.__dataclass_fields__ if name not in ("spec", "info"))
+ARRAYS = tuple(
+    name for name in DatasetArrays.__dataclass_fields__ if name not in ("spec", "info", "places")
+)
 
 
 def fingerprint(root: Path | str) -> str:

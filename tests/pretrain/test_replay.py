@@ -204,8 +204,9 @@ def test_a_share_of_subgoals_leads_to_the_very_goal_of_a_demonstration(purposefu
     pursued = np.repeat(100 + rows[:, None], LAYOUT.goal_dim, axis=1)
     # The second episode alone ends, at rest, two centimetres from its goal.
     pursued[starts[1] : starts[2]] = paths[1][-1] + np.eye(9, dtype=np.float32)[0] * 0.02
-    observation = np.stack([rows, rows], 1)
-    data.extend(observation, np.concatenate(paths), rows[:, None], pursued, starts)
+    observation, achieved = np.stack([rows, rows], 1), np.concatenate(paths)
+    met = np.linalg.norm(achieved - pursued, axis=1) <= 0.05 if purposeful else None
+    data.extend(observation, achieved, rows[:, None], pursued, starts, success=met)
     mix = replace(MIXED, complete=share)
     observation, goal, _ = data.subgoals(COUNT, mix, np.random.default_rng(0))
     rows = observation[:, 0].long().numpy()
@@ -215,6 +216,15 @@ def test_a_share_of_subgoals_leads_to_the_very_goal_of_a_demonstration(purposefu
     assert not second[COUNT // 4 :].all()
     if first.all():
         assert same(goal[: COUNT // 4].numpy(), paths[1][-1]).all()
+
+
+def test_waypoints_are_where_objects_rest_whatever_the_goals_look_like():
+    paths = [path_of(OBJECTS, each) for each in EPISODES]
+    starts = np.cumsum([0, *map(len, paths)])
+    looks = np.random.default_rng(0).random((starts[-1], 5), np.float32)
+    seen = Trajectories(Layout(2, 5, 1), 10**6, None, purposeful=True)
+    seen.extend(looks[:, :2], looks, looks[:, :1], looks, starts, np.concatenate(paths))
+    np.testing.assert_array_equal(seen.waypoints.row, trajectories().waypoints.row)
 
 
 def test_pursued_goals_are_exactly_those_of_the_row_and_never_cloned():
