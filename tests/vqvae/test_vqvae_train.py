@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from image_samples import TINY, tiny_training
 
 from eisp_data.errors import ConfigError, DataError
