@@ -44,7 +44,7 @@ class MoversConfig:
 
     width: int = 128
     """Size of all hidden layers."""
-    modes: int = 2
+    modes: int = 4
     """Places apart from each other where the object that moves may go."""
     likelihood: float = 1.0
     """Weight of L_HS, the negative log-likelihood of the hindsight subgoals."""

@@ -5,14 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+from torch import Tensor, nn
 
 from eisp_data.storage.cache import DatasetArrays
 
 _RIDGE = 1.0
 _ON_TABLE_M = 0.6
 """Further from the robot's base than this, or below the table, nothing is in the picture."""
-_MOST_ROWS = 20_000
-_ITERATIONS, _ACCURACY, _TINY = 200, 1e-3, 1e-30
+_MOST_ROWS = 200_000
+"""Cells x K weights are to be found from them."""
+_ITERATIONS, _ACCURACY, _TINY = 100, 1e-3, 1e-30
 
 
 @dataclass(frozen=True)
@@ -90,27 +93,29 @@ def _code_map(
     """Ridge regression on cells x K indicators, by conjugate gradients (Hestenes and Stiefel)."""
     cells = codes.shape[1]
     offsets = np.arange(cells) * count
+    inputs, others = (
+        torch.from_numpy(codes[part].astype(np.int64) + offsets) for part in (fit, held)
+    )
+    columns = inputs.flatten()
 
-    def forward(part: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        return weights[codes[part].astype(np.int64) + offsets].sum(1)
+    def forward(rows: Tensor, weights: Tensor) -> Tensor:
+        return nn.functional.embedding_bag(rows, weights, mode="sum")
 
-    columns = (codes[fit].astype(np.int64) + offsets).ravel()
+    def backward(values: Tensor) -> Tensor:
+        each = values.repeat_interleave(cells, 0)
+        return values.new_zeros(cells * count, values.shape[1]).index_add_(0, columns, each)
 
-    def backward(values: np.ndarray) -> np.ndarray:
-        each = (np.bincount(columns, np.repeat(v, cells), cells * count) for v in values.T)
-        return np.stack(list(each), 1)
-
-    weights = np.zeros((cells * count, target.shape[1]))
-    residual = backward(target)
-    direction, size = residual, (residual**2).sum(0)
+    residual = backward(torch.from_numpy(target).float())
+    weights = torch.zeros_like(residual)
+    direction, size = residual, residual.square().sum(0)
     first = size
     for _ in range(_ITERATIONS):
-        curved = backward(forward(fit, direction)) + _RIDGE * direction
-        step = size / np.maximum((direction * curved).sum(0), _TINY)
+        curved = backward(forward(inputs, direction)) + _RIDGE * direction
+        step = size / (direction * curved).sum(0).clamp(min=_TINY)
         weights = weights + step * direction
         residual = residual - step * curved
-        before, size = size, (residual**2).sum(0)
+        before, size = size, residual.square().sum(0)
         if (size <= _ACCURACY**2 * first).all():
             break
-        direction = residual + size / np.maximum(before, _TINY) * direction
-    return forward(held, weights)
+        direction = residual + size / before.clamp(min=_TINY) * direction
+    return forward(others, weights).double().numpy()

@@ -86,6 +86,11 @@ class Movers(SubgoalProposer):
         scale = nn.functional.softplus(spread).clamp(max=_MOST_SCALE) + _LEAST_SCALE
         return logits.log_softmax(-1), mean.flatten(1, 2), scale.flatten(1, 2)
 
+    def _of(self, mover: Tensor, each: Tensor) -> Tensor:
+        """Return (B, modes) of (B, M): the components in which object ``mover`` (B,) moves."""
+        rows = torch.arange(len(mover), device=mover.device)
+        return each.unflatten(1, (-1, self.config.modes))[rows, mover]
+
     def _relative(self, observation: Tensor, goal: Tensor) -> Tensor:
         """Return (B, n, 3): goals relative to where the objects are, decimetres."""
         return (goal[:, self._columns] - self._place(observation)) * _SCALE
@@ -118,16 +123,18 @@ class Movers(SubgoalProposer):
         """Return beta L_HS + reconstruction + divergence, weighted as configured."""
         log_weight, mean, scale = self.components(observation, goal)
         target = self._relative(observation, subgoal)
-        each = laplace.log_prob(target.flatten(1)[:, None], mean.flatten(2), scale.flatten(2))
+        places = target.flatten(1)[:, None], mean.flatten(2), scale.flatten(2)
         # Who moved is known in hindsight, the object that went furthest; in which way is not.
         mover = target.norm(dim=-1).argmax(1)
-        rows = torch.arange(len(mover), device=mover.device)
-        joint = (log_weight + each).unflatten(1, (-1, self.config.modes))
-        likelihood = joint[rows, mover].logsumexp(-1)
-        sampled = laplace.sample(mean, scale)
-        places = self._place(observation)[:, None] * _SCALE + sampled
-        state = observation[:, None].expand(-1, places.shape[1], -1)
-        guess = self.decoder(torch.cat([state, places.flatten(2)], -1))
+        joint = self._of(mover, log_weight + laplace.log_prob(*places))
+        likelihood = joint.logsumexp(-1)
+        # The gradient of a mixture is that of its parts by their shares.
+        share = joint.softmax(-1).detach()
+        parts = self._of(mover, log_weight + laplace.even_log_prob(*places))
+        learned = (share * parts).sum(-1)
+        drawn = self._place(observation)[:, None] * _SCALE + laplace.sample(mean, scale)
+        state = observation[:, None].expand(-1, drawn.shape[1], -1)
+        guess = self.decoder(torch.cat([state, drawn.flatten(2)], -1))
         true_goal = goal[:, self._columns].flatten(1)[:, None] * _SCALE
         # A unit-scale Laplace in decimetres, constants dropped.
         missed = (guess - true_goal).abs().sum(-1)
@@ -137,7 +144,7 @@ class Movers(SubgoalProposer):
         divergence = (weight * divergence).sum(1)
         config = self.config
         loss = (
-            -config.likelihood * likelihood
+            -config.likelihood * learned
             + config.reconstruction * reconstruction
             + config.divergence * divergence
         ).mean()
