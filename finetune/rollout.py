@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from finetune.selector import select, within_reach
+from finetune.selector import select
 from pretrain.agent import Agent
 
 _LET_GO_STEPS = 10
@@ -141,9 +141,7 @@ class SubgoalPolicy:
         candidates, likelihood = self._propose(state, goal)
         here = self._tensor(achieved_goal)
         idle = self._tensor(self.idle[renew] >= self._config.every_steps)
-        chosen = select(self._agent, state, here, candidates, likelihood, idle)
-        direct = within_reach(self._agent, state, goal)
-        return torch.where(direct[:, None], goal, chosen).cpu().numpy()
+        return select(self._agent, state, here, candidates, likelihood, idle).cpu().numpy()
 
     def _propose(self, state: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
         count = self._config.candidates

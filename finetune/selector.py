@@ -63,14 +63,5 @@ def select(
     return candidates[torch.arange(batch), score.argmax(1)]
 
 
-def within_reach(agent: Agent, observation: Tensor, goal: Tensor) -> Tensor:
-    """Return whether the critic expects to reach a goal (B, G) from an observation (B, S) in no
-    more than ``direct_steps``, (B,) bool: each of them costs one, discounted."""
-    gamma, steps = agent.config.sac.gamma, agent.config.subgoals.direct_steps
-    if not steps:
-        return torch.zeros(len(goal), dtype=torch.bool, device=goal.device)
-    return agent.sac.value(observation, goal) >= -(1.0 - gamma**steps) / (1.0 - gamma)
-
-
 _DROPPED = 1e4
 """More than any difference of scores: dropped candidates come last."""

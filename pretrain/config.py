@@ -83,8 +83,6 @@ class SubgoalConfig:
     """A subgoal is reached within this distance (the paper's epsilon)."""
     final_m: float = 0.05
     """A subgoal this near to the final goal gives way to it (the paper's epsilon)."""
-    direct_steps: int = 0
-    """A final goal that the critic expects to reach in so many steps needs no subgoal."""
     sample_when_stuck: bool = True
     """Sample the actions towards a subgoal, if the last one was not reached nor come nearer."""
     rest_when_met: bool = True

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from eisp_data.policies.drawer import opening_of, push_block, slide_drawer
+from eisp_data.policies.drawer import opening_of, slide_drawer
 from eisp_data.policies.pick_place import pick, place
 from eisp_data.policies.script import OPEN, Aim, Keyframe, View
 from eisp_data.sim.drawer import PATH_HALF_WIDTH_M, TRAVEL_M
@@ -54,10 +54,14 @@ def _put_away(view: View, aim: Aim) -> Iterator[Keyframe]:
 
 
 def _clear(view: View, aim: Aim) -> Iterator[Keyframe]:
-    """Push the block out of the drawer's way if it is in it."""
+    """Put the block out of the drawer's way if it is in it.
+
+    It is carried: pushed, it may end up where the gripper does not come.
+    """
     x, y = view.blocks[0, :2]
     if _in_way(view):
-        yield from push_block(view, aim, np.array([x, np.copysign(_ASIDE_M, y)]))
+        aside = np.array([x, np.copysign(_ASIDE_M, y), BLOCK_SIZE_M / 2])
+        yield from _carry(view, aim, aside)
 
 
 def _carry(view: View, aim: Aim, target: np.ndarray) -> Iterator[Keyframe]:

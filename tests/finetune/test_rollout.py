@@ -87,17 +87,6 @@ def test_where_the_final_goal_is_met_nothing_else_is_proposed():
     assert policy.subgoal[:, 0].tolist() == [0.0, 1.0]
 
 
-@pytest.mark.parametrize(("steps", "expected"), [(0, 1.0), (9, 1.0), (12, 5.0)])
-def test_a_goal_that_the_critic_expects_to_reach_soon_needs_no_subgoal(steps, expected):
-    policy = counting_policy(direct_steps=steps)
-    sac = policy._agent.sac
-    # The goal five metres away is worth what ten steps cost.
-    worth = -sum(sac.config.gamma**k for k in range(10))
-    sac.critic.body.weights[0].data[:, 2, 0] = worth / 5.0
-    step(policy)
-    assert policy.subgoal[:, 0].tolist() == [expected] * 2
-
-
 def test_without_subgoals_the_final_goal_is_followed_alone():
     policy = counting_policy(source="none")
     desired = np.array([[3.0, 1.0], [4.0, 2.0]], np.float32)
