@@ -118,4 +118,4 @@ def _code_map(
         if (size <= _ACCURACY**2 * first).all():
             break
         direction = residual + size / before.clamp(min=_TINY) * direction
-    return forward(others, weights).double().numpy()
+    return forward(others, weights).numpy()

@@ -10,21 +10,22 @@ from torch import Tensor
 
 def log_prob(value: Tensor, mean: Tensor, scale: Tensor) -> Tensor:
     """Return log p(value), summed over the last dimension."""
-    return _each(value, mean, scale).sum(-1)
+    return log_probs(value, mean, scale).sum(-1)
 
 
-def even_log_prob(value: Tensor, mean: Tensor, scale: Tensor) -> Tensor:
-    """Return log p(value), each dimension times the root of its scale, to learn from.
+def log_probs(value: Tensor, mean: Tensor, scale: Tensor) -> Tensor:
+    """Return log p(value) of each dimension."""
+    return -(value - mean).abs() / scale - (2 * scale).log()
+
+
+def evened(log_probs: Tensor, scale: Tensor) -> Tensor:
+    """Return what to learn from: the log p of each dimension, times the root of its scale.
 
     The gradient of a mean is 1 / scale: what is known to the millimetre drowns out what is not yet
     known at all, and that stays so. With the root they are heard more evenly; where the optimum
     lies is the same (beta-NLL, Seitzer et al. 2022, with beta 1/2).
     """
-    return (_each(value, mean, scale) * scale.detach().sqrt()).sum(-1)
-
-
-def _each(value: Tensor, mean: Tensor, scale: Tensor) -> Tensor:
-    return -(value - mean).abs() / scale - (2 * scale).log()
+    return log_probs * scale.detach().sqrt()
 
 
 def kl_to_standard_normal(mean: Tensor, scale: Tensor) -> Tensor:

@@ -123,14 +123,15 @@ class Movers(SubgoalProposer):
         """Return beta L_HS + reconstruction + divergence, weighted as configured."""
         log_weight, mean, scale = self.components(observation, goal)
         target = self._relative(observation, subgoal)
-        places = target.flatten(1)[:, None], mean.flatten(2), scale.flatten(2)
+        scales = scale.flatten(2)
+        each = laplace.log_probs(target.flatten(1)[:, None], mean.flatten(2), scales)
         # Who moved is known in hindsight, the object that went furthest; in which way is not.
         mover = target.norm(dim=-1).argmax(1)
-        joint = self._of(mover, log_weight + laplace.log_prob(*places))
+        joint = self._of(mover, log_weight + each.sum(-1))
         likelihood = joint.logsumexp(-1)
         # The gradient of a mixture is that of its parts by their shares.
         share = joint.softmax(-1).detach()
-        parts = self._of(mover, log_weight + laplace.even_log_prob(*places))
+        parts = self._of(mover, log_weight + laplace.evened(each, scales).sum(-1))
         learned = (share * parts).sum(-1)
         drawn = self._place(observation)[:, None] * _SCALE + laplace.sample(mean, scale)
         state = observation[:, None].expand(-1, drawn.shape[1], -1)
