@@ -40,14 +40,15 @@ class Options:
 class Ours:
     """The training step of ``eisp-vqvae train``."""
 
-    def __init__(self, config: VqVaeConfig) -> None:
+    def __init__(self, config: VqVaeConfig, batch_size: int) -> None:
         torch.manual_seed(0)
-        self._model = VqVae(config)
+        self._model = VqVae(config, 6)
+        self._places = torch.zeros(batch_size, 6)
         self._optimizer = torch.optim.Adam(self._model.parameters(), lr=1e-4, fused=True)
 
     def update(self, images: Tensor) -> None:
         """Learn from one batch."""
-        step(self._model, self._optimizer, images, "cpu", fast=True)
+        step(self._model, self._optimizer, images, self._places, "cpu", fast=True)
 
 
 class Peer:
@@ -57,7 +58,7 @@ class Peer:
         from vector_quantize_pytorch import VectorQuantize
 
         torch.manual_seed(0)
-        self._model = VqVae(config)
+        self._model = VqVae(config, 6)
         self._quantise = VectorQuantize(
             dim=config.latent_channels,
             codebook_size=config.codes,
@@ -83,7 +84,7 @@ def main(options: Options) -> None:
     torch.set_num_threads(options.threads)
     config = VqVaeConfig(channels=options.channels, codes=options.codes)
     images = torch.randint(0, 256, (options.batch_size, 48, 48, 3), dtype=torch.uint8)
-    sides: dict[str, Ours | Peer] = {"ours": Ours(config), "peer": Peer(config)}
+    sides: dict[str, Ours | Peer] = {"ours": Ours(config, options.batch_size), "peer": Peer(config)}
     spent: dict[str, list[float]] = {name: [] for name in sides}
     for turn in range(options.turns + 1):
         for name, side in sides.items():

@@ -145,7 +145,8 @@ def _batch(
         some |= worlds.success
         if watch:
             watch(worlds, policy)
-    distance = np.linalg.norm(worlds.achieved_goal - policy.subgoal, axis=1)
+    way = agent.layout.apart(worlds.achieved_goal, policy.subgoal)
+    distance = np.linalg.norm(way, axis=1)
     return worlds.success, worlds.success & worlds.settled, some, returns, distance
 
 

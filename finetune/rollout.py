@@ -34,7 +34,7 @@ class SubgoalPolicy:
         self.age = np.full(worlds, self._config.every_steps)
         self.start = np.full_like(self.subgoal, np.inf)
         self.stuck = np.zeros(worlds, bool)
-        self.met = np.zeros(worlds, np.int64)
+        self.met: np.ndarray = np.zeros(worlds, np.int64)
         self.idle = np.zeros(worlds, np.int64)
 
     def reset(self, worlds: np.ndarray) -> None:
@@ -45,7 +45,10 @@ class SubgoalPolicy:
 
     def reached(self, achieved_goal: np.ndarray) -> np.ndarray:
         """Return whether each world is at its subgoal, (N,) bool, of (N, G) achieved goals."""
-        return np.linalg.norm(achieved_goal - self.subgoal, axis=1) <= self._config.reached_m
+        return self._distance(achieved_goal, self.subgoal) <= self._config.reached_m
+
+    def _distance(self, goal: np.ndarray, other: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(self._agent.layout.apart(goal, other), axis=1)
 
     @torch.no_grad()
     def act(
@@ -67,7 +70,7 @@ class SubgoalPolicy:
             (N, A) float32 in [-1, 1].
         """
         reached = self.reached(achieved_goal)
-        missed = np.linalg.norm(achieved_goal - desired_goal, axis=1)
+        missed = self._distance(achieved_goal, desired_goal)
         self.met = (self.met + 1) * (missed <= self._config.final_m)
         done = (self.met > _LET_GO_STEPS) & self._config.rest_when_met
         renew = np.flatnonzero((reached | (self.age >= self._config.every_steps)) & ~done)
@@ -102,7 +105,7 @@ class SubgoalPolicy:
         move: noise would topple the tower.
         """
         was, now = (
-            np.linalg.norm(self.subgoal[renew] - place, axis=1)
+            self._distance(self.subgoal[renew], place)
             for place in (self.start[renew], achieved_goal[renew])
         )
         still = was - now < self._config.reached_m
@@ -120,7 +123,7 @@ class SubgoalPolicy:
         """Choose the next subgoals of the worlds named by ``renew``."""
         desired = desired_goal[renew]
         chosen = self._choose(renew, observation[renew], achieved_goal[renew], desired)
-        near = np.linalg.norm(chosen - desired, axis=1) <= self._config.final_m
+        near = self._distance(chosen, desired) <= self._config.final_m
         # A goal that is met is left alone: a generator always knows some other way on.
         final = near | (self.met[renew] > 0)
         self.subgoal[renew] = np.where(final[:, None], desired, chosen)

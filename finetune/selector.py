@@ -54,7 +54,7 @@ def select(
     repeated = observation[:, None].expand(-1, count, -1).flatten(0, 1)
     score = agent.sac.value(repeated, candidates.flatten(0, 1)).view(batch, count)
     if agent.config.subgoals.selector == "likely":
-        way = (candidates - achieved_goal[:, None]).norm(dim=-1)
+        way = agent.layout.apart(candidates, achieved_goal[:, None]).norm(dim=-1)
         trivial = way <= agent.config.subgoals.reached_m
         compared = likelihood - _DROPPED * (trivial & idle[:, None])
         unlikely = likelihood < compared.amax(1, keepdim=True) + _LEAST_WEIGHT

@@ -145,7 +145,7 @@ class Finetuner:
         self._offline = offline
         parts = agent.config.waypoints
         if agent.vision and parts is None:
-            # What is at rest is known of demonstrations; in an image the gripper always moves.
+            # What is at rest is known of demonstrations; places read off images waver.
             parts = max(1, config.round_steps // agent.config.subgoals.every_steps)
         self._online = Trajectories(agent.layout, config.replay_size, parts, purposeful=False)
         self._learner = Learner(agent, config.lr, config.generator_lr, threads)
@@ -212,9 +212,12 @@ class Finetuner:
         """Draw what the generator learns from, out of old or new data as there is of each.
 
         Half of it new, as for SAC, it would in the first rounds be the same few trajectories over
-        and over: in Store success fell from 72% to 4%.
+        and over: in Store success fell from 72% to 4%. From images it learns from the old alone,
+        of which it is known where objects came to rest.
         """
         new, old = len(self._online.leading), len(self._offline.leading)
+        if self.agent.vision and old:
+            new = 0
         if not new + old:
             return None
         source = self._online if self._rng.random() * (new + old) < new else self._offline

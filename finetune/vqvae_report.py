@@ -113,7 +113,9 @@ def subgoal_strip(policy: Path, model: VqVae, seed: int) -> np.ndarray:
             worlds.step(action)
     seen.append(worlds.images()[0])
     headed.append(worlds.desired_goal[0])
-    return strip(np.stack(seen), agent.vision.decode(torch.from_numpy(np.stack(headed))).numpy())
+    latents = torch.from_numpy(np.stack(headed))[:, model.places :]
+    decoded = agent.vision.decode(latents).numpy()
+    return strip(np.stack(seen), decoded)
 
 
 def strip(above: np.ndarray, below: np.ndarray) -> np.ndarray:

@@ -18,6 +18,7 @@ from pretrain.features import ObjectFeatures, PlainFeatures
 from pretrain.layout import Layout
 from pretrain.proposers.hybrid import Hybrid
 from pretrain.proposers.movers import Movers
+from pretrain.proposers.pictured import PicturedMovers
 from pretrain.proposers.proposer import SubgoalProposer
 from pretrain.sac import Sac
 from vqvae.model import VqVae
@@ -49,18 +50,15 @@ class Agent(nn.Module):
             )
         self.config, self.layout = config, layout
         features: nn.Module = (
-            ObjectFeatures(layout)
+            ObjectFeatures(layout, moments)
             if config.features == "objects"
             else PlainFeatures(layout, moments)
         )
         self.sac = Sac(features, layout.action_dim, config.sac)
-        self.proposer: SubgoalProposer = (
-            Movers(layout, config.movers)
-            if config.generator == "movers"
-            else Hybrid(layout, moments, config.hybrid)
-        )
+        self.proposer = _proposer(config, layout, moments)
         self.register_buffer("bank", bank)
-        self.vision = VqVae(config.vision.model).requires_grad_(False) if config.vision else None
+        vision = config.vision
+        self.vision = VqVae(vision.model, vision.places).requires_grad_(False) if vision else None
 
     def save(self, folder: Path) -> None:
         """Write ``config.json`` and ``model.safetensors``, each whole or not at all."""
@@ -90,6 +88,14 @@ class Agent(nn.Module):
 
 
 _NEEDS = {"movers": "objects"}
+
+
+def _proposer(config: AgentConfig, layout: Layout, moments: dict[str, Tensor]) -> SubgoalProposer:
+    if config.generator == "hybrid":
+        return Hybrid(layout, moments, config.hybrid)
+    if layout.latent_dim:
+        return PicturedMovers(layout, moments, config.movers)
+    return Movers(layout, config.movers)
 
 
 def empty_moments(layout: Layout) -> dict[str, Tensor]:

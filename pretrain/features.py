@@ -48,15 +48,23 @@ class PlainFeatures(nn.Module):
 class ObjectFeatures(nn.Module):
     """The object that has the longest way to its goal first, the others by their distance to it.
 
-    Objects change places only with others of their kind.
+    Objects change places only with others of their kind. The latent of an image comes last,
+    standardised; of a goal only the places count, for its reward depends on nothing else.
     """
 
-    def __init__(self, layout: Layout) -> None:
+    latent_mean: Tensor
+    latent_std: Tensor
+
+    def __init__(self, layout: Layout, moments: dict[str, Tensor]) -> None:
         super().__init__()
+        if layout.latent_dim:
+            for name in ("mean", "std"):
+                latent = moments[f"observation_{name}"][-layout.latent_dim :]
+                self.register_buffer(f"latent_{name}", latent.clone())
         self._layout = layout
         self._interchangeable = layout.kinds == 1 and len(layout.objects) > 1
         count = len(layout.objects)
-        self.size = layout.robot_dim + _TOKEN_DIM * count + 6 * (count - 1)
+        self.size = layout.robot_dim + _TOKEN_DIM * count + 6 * (count - 1) + layout.latent_dim
         if not self._interchangeable:
             self.size += count
 
@@ -76,6 +84,9 @@ class ObjectFeatures(nn.Module):
             extra = []
         else:
             extra = [torch.zeros_like(way).scatter_(1, focus[:, None], 1.0)]
+        if self._layout.latent_dim:
+            latent = observation[:, -self._layout.latent_dim :]
+            extra.append(((latent - self.latent_mean) / self.latent_std).clamp(-10, 10))
         position = tokens[..., _POSITION]
         target = position[:, :1] + tokens[:, :1, _WAY]
         others = [position[:, 1:] - position[:, :1], position[:, 1:] - target]

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
-from eisp_data.tasks.base import GRIPPER_DIM, Task
+import numpy as np
+from torch import Tensor
+
+from eisp_data.tasks.base import GRIPPER_DIM, OBJECT_DIM, Task
+
+Goals = TypeVar("Goals", np.ndarray, Tensor)
 
 
 @dataclass(frozen=True)
@@ -22,7 +28,7 @@ class ObjectIndex:
 class Layout:
     """Sizes, and the objects where the environment has any.
 
-    Without objects (any other ``GoalEnv``, or images) the networks see plain vectors.
+    Without objects (any other ``GoalEnv``) the networks see plain vectors.
     """
 
     observation_dim: int
@@ -31,10 +37,18 @@ class Layout:
     robot_dim: int = 0
     """Leading features of the observation that are the robot's own."""
     objects: tuple[ObjectIndex, ...] = ()
+    latent_dim: int = 0
+    """Of goal and observation, the last so many components are the latent of an image. It is no
+    part of the distance between goals."""
+
+    def apart(self, goals: Goals, others: Goals) -> Goals:
+        """Return the way between (..., G) goals: what their distance is the norm of."""
+        count = self.goal_dim - self.latent_dim
+        return goals[..., :count] - others[..., :count]
 
     @classmethod
     def of(cls, task: Task) -> Layout:
-        """Return the layout of a task on the table."""
+        """Return the layout of a task on the table as its states say it."""
         kinds = sorted({slot.kind for slot in task.objects})
         return cls(
             observation_dim=task.paper.observation_dim,
@@ -45,6 +59,16 @@ class Layout:
                 ObjectIndex(kinds.index(slot.kind), slot.observation.start, slot.goal.start)
                 for slot in task.objects
             ),
+        )
+
+    def seen(self, latent_dim: int) -> Layout:
+        """Return this layout for images: without what follows the objects, and with a latent."""
+        end = max(item.observation for item in self.objects) + OBJECT_DIM
+        return replace(
+            self,
+            observation_dim=end + latent_dim,
+            goal_dim=self.goal_dim + latent_dim,
+            latent_dim=latent_dim,
         )
 
     @property

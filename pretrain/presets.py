@@ -48,7 +48,8 @@ def image_preset(
     """
     state = preset(name, vision.task, root, output_dir)
     agent = replace(state.agent, task=image_task(vision.task), vision=vision)
-    return _IMAGE_PRESETS[name](replace(state, agent=agent, vqvae=VqVaePath(vqvae)))
+    seen = replace(state, agent=agent, vqvae=VqVaePath(vqvae))
+    return replace(seen, generator_lr=_PAPER_IMAGE_GENERATOR_LR) if name == "paper" else seen
 
 
 _FOREIGN_WAYPOINTS = 4
@@ -125,40 +126,8 @@ def _paper(task: str, root: Path, output_dir: Path) -> PretrainConfig:
     )
 
 
-def _cpu_image(config: PretrainConfig) -> PretrainConfig:
-    agent = config.agent
-    return replace(
-        config,
-        agent=replace(
-            agent,
-            features="plain",
-            generator="hybrid",
-            # Beside the divergence of 108 components the paper's beta leaves nothing of L_HS.
-            hybrid=HybridConfig(beta=_BETA),
-            subgoals=SubgoalConfig(
-                candidates=1,
-                every_steps=_IMAGE_SUBGOAL_STEPS,
-                reached_m=SUCCESS_DISTANCE_M,
-                final_m=_IMAGE_FINAL_M,
-            ),
-            mix=GoalMix(waypoint=0.5, future=0.5, displaced=0.0),
-        ),
-        generator_lr=1e-3,
-    )
-
-
-_IMAGE_SUBGOAL_STEPS = 20
-"""As online, where the waypoints are as far apart."""
-_IMAGE_FINAL_M = 0.03
-"""A block is a small part of a picture: at 5 cm Store's goal, a shut drawer, seemed met with the
-block on the table. What is really so is nearer than 3 cm."""
 _PAPER_IMAGE_GENERATOR_LR = 3e-5
 """Appendix "Image-based observation processing", as the batch, which is that of Table I."""
 
 
-def _paper_image(config: PretrainConfig) -> PretrainConfig:
-    return replace(config, generator_lr=_PAPER_IMAGE_GENERATOR_LR)
-
-
 _PRESETS = {"cpu": _cpu, "paper": _paper}
-_IMAGE_PRESETS = {"cpu": _cpu_image, "paper": _paper_image}

@@ -11,7 +11,8 @@ from pretrain.hindsight import Waypoints, find_waypoints
 from pretrain.layout import Layout
 from pretrain.sac import Batch
 
-_MOVED_M = 0.01
+_MOVED_M, _READ_MOVED_M = 0.01, 0.02
+"""Going less far is not a move; where places are read off images, they waver."""
 _LEAST_STD = 1e-3
 """A dimension that varies by less, a millimetre where it is a length, says nothing."""
 
@@ -41,6 +42,7 @@ class Trajectories:
         self._success = np.empty(0, bool)
         self.episode_start = np.zeros(1, np.int64)
         self.waypoints = Waypoints(*(np.empty(0, np.int64) for _ in range(3)))
+        self._moved_m = _READ_MOVED_M if layout.latent_dim else _MOVED_M
         self._index()
 
     def __len__(self) -> int:
@@ -113,10 +115,11 @@ class Trajectories:
         goal = self.achieved_goal.take(source, 0)
         self._displace(goal, rows, kind == 2, rng)
         start, after = (self.achieved_goal.take(rows + k, 0) for k in (0, 1))
-        moved = np.linalg.norm(goal - start, axis=1) > _MOVED_M
-        goal += self._jitter(mix, goal.shape, rng)
+        apart = self._layout.apart
+        moved = np.linalg.norm(apart(goal, start), axis=1) > self._moved_m
+        self._jitter(goal, mix, rng)
         goal[kind == 3] = self.pursued[rows[kind == 3]]
-        reached = np.linalg.norm(after - goal, axis=1) <= mix.tolerance_m
+        reached = np.linalg.norm(apart(after, goal), axis=1) <= mix.tolerance_m
         # What a trajectory does while nothing moves yet serves its next move, not this goal.
         at_end = (kind == 0) & (source == self._last[rows])
         clone = (kind < 2) & (moved | at_end)
@@ -160,14 +163,15 @@ class Trajectories:
             result[f"{name}_std"] = torch.from_numpy(std.astype(np.float32))
         return result
 
-    def _jitter(self, mix: GoalMix, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-        """Draw what is added to goals: errors of about half the tolerance in all.
+    def _jitter(self, goal: np.ndarray, mix: GoalMix, rng: np.random.Generator) -> None:
+        """Add errors of about half the tolerance in all to (B, G) goals.
 
         Goals taken from a trajectory are met exactly, those of a rollout never: what is done well
         enough must look done, and not like a place to correct.
         """
-        std = mix.tolerance_m / (2.0 * self._layout.goal_dim**0.5)
-        return rng.standard_normal(shape, np.float32) * np.float32(std)
+        places = goal[:, : self._layout.goal_dim - self._layout.latent_dim]
+        std = mix.tolerance_m / (2.0 * places.shape[1] ** 0.5)
+        places += rng.standard_normal(places.shape, np.float32) * np.float32(std)
 
     def subgoals(
         self, count: int, mix: GoalMix, rng: np.random.Generator
@@ -183,8 +187,9 @@ class Trajectories:
         subgoal, goal = self.waypoints.subgoal_and_goal(rows, rng)
         goal[:whole] = self.waypoints.furthest(rows[:whole])
         final = self.achieved_goal[goal]
+        self._jitter(final, mix, rng)
         return (
             torch.from_numpy(self.observation[rows]),
-            torch.from_numpy(final + self._jitter(mix, final.shape, rng)),
+            torch.from_numpy(final),
             torch.from_numpy(self.achieved_goal[subgoal]),
         )

@@ -15,6 +15,7 @@ from eisp_data.runs.episodes import rows_of, split
 from eisp_data.runs.folder import begin_run, has_progress
 from eisp_data.runs.metrics import MetricsLog
 from eisp_data.storage.cache import DatasetArrays
+from eisp_data.tasks.images import state_task
 from eisp_data.tasks.registry import TASKS
 from pretrain import checkpoint
 from pretrain.agent import BANK, Agent
@@ -105,12 +106,11 @@ def validate(agent: Agent, held_out: Trajectories, device: str) -> dict[str, Ten
     observation, goal, subgoal = (tensor.to(device) for tensor in sample)
     _, info = agent.proposer.loss(observation, goal, subgoal)
     proposed = agent.proposer.propose(observation, goal, 1)[0][:, 0]
-    hits = (proposed - subgoal).norm(dim=-1) <= _NEAR_M
-    goal_dim = agent.layout.goal_dim
-    each = 3 if agent.layout.objects else goal_dim
-    part = proposed[:256].view(-1, 1, goal_dim // each, each)
-    known = agent.bank.view(1, len(agent.bank), -1, each)
-    apart = (part - known).norm(dim=-1).amax(-1).amin(-1)
+    layout = agent.layout
+    hits = layout.apart(proposed, subgoal).norm(dim=-1) <= _NEAR_M
+    each = 3 if layout.objects else layout.goal_dim
+    way = layout.apart(proposed[:256, None], agent.bank[None])
+    apart = way.unflatten(-1, (-1, each)).norm(dim=-1).amax(-1).amin(-1)
     near = apart <= _NEAR_M
     return info | {"hits": hits.float().mean(), "near_data": near.float().mean()}
 
@@ -120,7 +120,7 @@ def load_trajectories(
 ) -> tuple[Trajectories, Trajectories, Layout]:
     """Read the dataset into memory, split by episode into what is learned from and held out."""
     arrays = load_seen(config.dataset.root, config.agent, vision)
-    layout = layout_of(arrays)
+    layout = layout_of(arrays, 0 if vision is None else vision.latent_dim)
     held, rest = split(arrays.num_episodes, config.validation_share, config.seed)
     if not len(rest):
         raise DataError(f"{config.dataset.root} has too few episodes: {arrays.num_episodes}")
@@ -133,12 +133,18 @@ def load_trajectories(
     return train, held_out, layout
 
 
-def layout_of(arrays: DatasetArrays) -> Layout:
+def layout_of(arrays: DatasetArrays, latent_dim: int = 0) -> Layout:
     """Return the layout of a dataset's environment.
+
+    Args:
+        arrays: of the dataset.
+        latent_dim: components of the latent of an image, none if it is not seen in images.
 
     A recording of a robot may be of a task of ours and yet have an observation of its own.
     """
     spec = arrays.spec
+    if latent_dim:
+        return Layout.of(TASKS[state_task(spec.task)]).seen(latent_dim)
     plain = Layout(spec.observation_dim, spec.goal_dim, spec.action_dim)
     known = Layout.of(TASKS[spec.task]) if spec.task in TASKS else plain
     sizes = known.observation_dim, known.goal_dim, known.action_dim

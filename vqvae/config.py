@@ -22,6 +22,9 @@ class VqVaeConfig:
     """K, the size of the codebook; the paper does not give it."""
     commitment: float = 0.25
     """Weight of the commitment loss (beta of van den Oord et al. 2017)."""
+    reading: float = 0.1
+    """Weight of the distance in decimetres between where the objects were and where the reader
+    reads them; 0 teaches the reader alone, as the paper's VQ-VAE knows no places."""
     decay: float = 0.99
     """Of the moving averages that the codes follow (the same paper, its appendix A.1)."""
     revive_after: int = 100
@@ -37,6 +40,8 @@ class VisionConfig:
     camera: str
     """Which camera saw them."""
     model: VqVaeConfig
+    places: int
+    """Coordinates of all objects together, which are read off its latents."""
 
 
 @dataclass(frozen=True)

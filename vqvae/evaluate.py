@@ -13,9 +13,9 @@ from eisp_data.runs.episodes import rows_of, split
 from eisp_data.sim.pixels import Pixels
 from eisp_data.storage.cache import load_arrays, load_images
 from eisp_data.tasks.registry import get_task
-from vqvae import calibrate
+from vqvae import reading
 from vqvae.config import VisionConfig, VqVaeTrainConfig
-from vqvae.latents import embed, encode, load_codes
+from vqvae.latents import encode, load_codes, see
 from vqvae.model import VqVae
 from vqvae.probe import Probe, probe
 from vqvae.quality import Quality, measure
@@ -38,11 +38,11 @@ class VqVaeEvaluation:
     """Of each object of the goal."""
     changed_by_video: float | None
     """Share of the codes that storing the images as video changes, None without a simulator."""
-    calibration: calibrate.Calibration
+    reading: reading.Reading
 
     def table(self) -> str:
         """Return the figures as text."""
-        found, reach = self.quality, self.calibration
+        found, read = self.quality, self.reading
         lines = [
             f"{self.task}: {self.images} images of held-out episodes",
             f"PSNR                      {found.psnr_db:.2f} dB",
@@ -57,9 +57,14 @@ class VqVaeEvaluation:
         if self.changed_by_video is not None:
             lines.append(f"codes changed by video    {self.changed_by_video:.2%}")
         lines += [
-            f"reached within            {reach.distance:.4g} of unscaled latents: "
-            f"{reach.found:.1%} of pairs within 5 cm, not {reach.rejected:.1%} of others",
-            f"objects within 5 cm       in {reach.right:.1%} of the pairs that count as reached",
+            f"{name + ' by the reader':26}{mean:.1f} mm, 95% within "
+            f"{read.percentile_95_mm[name]:.1f} mm"
+            for name, mean in read.mean_mm.items()
+        ]
+        lines += [
+            f"read as within 5 cm       {read.found:.1%} of the pairs of frames that are, not "
+            f"{read.rejected:.1%} of the others",
+            f"within 5 cm               {read.right:.1%} of the pairs that are read as such",
         ]
         return "\n".join(lines)
 
@@ -70,6 +75,8 @@ def evaluate(path: Path, root: Path | None = None) -> VqVaeEvaluation:
     trained = training_of(path)
     root = root or trained.dataset.root
     arrays, codes = load_arrays(root), load_codes(root, model, vision.camera)
+    seen = see(model, codes)
+    places, latents = seen[:, : model.places], seen[:, model.places :]
     held, rest = split(arrays.num_episodes, trained.validation_share, trained.seed)
     rows, held_rows = rows_of(arrays, rest), rows_of(arrays, held)
     chosen = spread(held_rows, _MOST)
@@ -78,11 +85,9 @@ def evaluate(path: Path, root: Path | None = None) -> VqVaeEvaluation:
         task=vision.task,
         images=len(chosen),
         quality=measure(model, load_images(root, vision.camera)[chosen]),
-        probes=probe(
-            embed(model, codes), codes, vision.model.codes, arrays, names, rows, held_rows
-        ),
+        probes=probe(latents, codes, vision.model.codes, arrays, names, rows, held_rows),
         changed_by_video=_changed(model, vision, arrays.sim_state, codes, held_rows),
-        calibration=calibrate.check(model, codes, arrays, held),
+        reading=reading.check(places, arrays, held, names),
     )
 
 

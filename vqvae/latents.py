@@ -16,6 +16,7 @@ from eisp_data.errors import DataError
 from eisp_data.sim.pixels import Pixels
 from eisp_data.storage.cache import DatasetArrays, cached, load_arrays, load_images
 from eisp_data.storage.reader import read_spec
+from eisp_data.tasks.base import OBJECT_DIM
 from eisp_data.tasks.images import IMAGE_TASKS, goal_state, image_task
 from vqvae.config import VisionConfig
 from vqvae.model import VqVae
@@ -67,17 +68,39 @@ def encode(model: VqVae, images: np.ndarray) -> np.ndarray:
 
 
 @torch.no_grad()
-def embed(model: VqVae, codes: np.ndarray) -> np.ndarray:
-    """Return the latents (N, latent_dim) float32 of (N, cells) codes."""
-    index = torch.from_numpy(codes.astype(np.int64)).to(model.mean.device)
-    return model.embed(index).cpu().numpy()
+def see(model: VqVae, codes: np.ndarray) -> np.ndarray:
+    """Return what an agent sees of (N, cells) codes, (N, seen_dim) float32: places and latent."""
+    parts = [
+        model.see(torch.from_numpy(codes[i : i + _BATCH].astype(np.int64)).to(model.mean.device))
+        for i in range(0, len(codes), _BATCH)
+    ]
+    return torch.cat(parts).cpu().numpy() if parts else np.empty((0, model.seen_dim), np.float32)
+
+
+def observe(robot: np.ndarray, seen: np.ndarray, places: int) -> np.ndarray:
+    """Return the observation (N, 10 + 5 P + latent_dim) of an image task.
+
+    It is laid out as that of the state task, as far as an image says it: the robot's own part, for
+    each object its OBJECT_DIM features, of which all but its place and its place from the gripper
+    are zero, and the latent.
+
+    Args:
+        robot: (N, 10), its first three the place of the gripper.
+        seen: (N, seen_dim).
+        places: P of its components are places.
+    """
+    place = seen[:, :places].reshape(len(seen), -1, 3)
+    features = np.zeros((*place.shape[:2], OBJECT_DIM), np.float32)
+    features[..., :3] = place
+    features[..., 3:6] = place - robot[:, None, :3]
+    return np.hstack([robot, features.reshape(len(seen), -1), seen[:, places:]])
 
 
 def load_latent_arrays(root: Path, model: VqVae, config: VisionConfig) -> DatasetArrays:
     """Return a dataset's arrays as its image task sees them.
 
-    The observation is the robot's own part and the latent of the image, goals are latents: of the
-    images that were achieved, and of a picture of the desired goal. All else is unchanged.
+    The observation is made of what is seen of the image, see ``observe``; goals are what is seen of
+    the images that were achieved, and of a picture of the desired goal. All else is unchanged.
 
     Raises:
         DataError: the dataset is of another task than the VQ-VAE, or has not its images.
@@ -88,9 +111,9 @@ def load_latent_arrays(root: Path, model: VqVae, config: VisionConfig) -> Datase
         raise DataError(
             f"{root} is a dataset of {spec.task!r}, the VQ-VAE was trained on {config.task!r}"
         )
-    latents = embed(model, load_codes(root, model, config.camera))
+    seen = see(model, load_codes(root, model, config.camera))
+    observation = observe(arrays.observation[:, : spec.proprio_dim], seen, model.places)
     name = image_task(spec.task)
-    proprio = arrays.observation[:, : spec.proprio_dim]
     goals = cached(
         root,
         f"-goals-{config.camera}-{model.fingerprint()}",
@@ -102,12 +125,12 @@ def load_latent_arrays(root: Path, model: VqVae, config: VisionConfig) -> Datase
         spec=replace(
             spec,
             task=name,
-            observation_dim=spec.proprio_dim + model.latent_dim,
-            goal_dim=model.latent_dim,
+            observation_dim=observation.shape[1],
+            goal_dim=model.seen_dim,
         ),
-        observation=np.hstack([proprio, latents]),
-        achieved_goal=latents,
-        desired_goal=embed(model, goals),
+        observation=observation,
+        achieved_goal=seen,
+        desired_goal=see(model, goals),
         places=arrays.achieved_goal,
     )
 

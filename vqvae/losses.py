@@ -1,4 +1,5 @@
-"""What the VQ-VAE learns from: reconstruction and commitment (van den Oord et al. 2017, Eq. 3).
+"""What the VQ-VAE learns from: reconstruction and commitment (van den Oord et al. 2017, Eq. 3), and
+where the objects were, for a block is a small part of a picture and all that matters in it.
 
 The codes follow moving averages, so that the equation's second term is not a loss here.
 """
@@ -13,12 +14,15 @@ from vqvae.model import VqVae
 Info = dict[str, Tensor]
 
 
-def loss(model: VqVae, images: Tensor, *, fast: bool) -> tuple[Tensor, Info, tuple[Tensor, Tensor]]:
+def loss(
+    model: VqVae, images: Tensor, places: Tensor, *, fast: bool
+) -> tuple[Tensor, Info, tuple[Tensor, Tensor]]:
     """Return the loss on a batch.
 
     Args:
         model: the VQ-VAE.
         images: (B, H, W, 3) uint8.
+        places: (B, P) where the objects were, metres.
         fast: convolutions in bfloat16.
 
     Returns:
@@ -33,10 +37,15 @@ def loss(model: VqVae, images: Tensor, *, fast: bool) -> tuple[Tensor, Info, tup
         decoded = model.decode_cells(codes)
     reconstruction = nn.functional.mse_loss(decoded.float(), target)
     commitment = nn.functional.mse_loss(vectors, model.codebook.code[index])
-    total = reconstruction + model.config.commitment * commitment
+    # Without a weight, what is read teaches the reader alone and leaves the codes as they are.
+    weight = model.config.reading
+    latent = (codes if weight else codes.detach()).view(len(images), -1)
+    reading = model.reader.loss(latent, places)
+    total = reconstruction + model.config.commitment * commitment + (weight or 1.0) * reading
     info = {
         "loss": total.detach(),
         "reconstruction": reconstruction.detach(),
         "commitment": commitment.detach(),
+        "reading": reading.detach(),
     }
     return total, info, (vectors.detach(), index)

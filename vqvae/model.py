@@ -17,6 +17,7 @@ from eisp_data.config import to_plain
 from vqvae.codebook import Codebook
 from vqvae.config import VqVaeConfig
 from vqvae.deconvolution import Double
+from vqvae.reading import Reader
 
 STRIDE = 8
 """Pixels of an image along each side of a code."""
@@ -24,14 +25,17 @@ _LEAST_STD = 1e-3
 
 
 class VqVae(nn.Module):
-    """Images to codes and back."""
+    """Images to codes and back, and to the places of the objects.
+
+    Args:
+        config: the hyperparameters.
+        places: coordinates of all objects together that ``reader`` reads off a latent.
+    """
 
     mean: Tensor
     std: Tensor
-    unit: Tensor
-    """Factor of latents, set by ``vqvae.calibrate``: 0.05 apart is what 5 cm are elsewhere."""
 
-    def __init__(self, config: VqVaeConfig) -> None:
+    def __init__(self, config: VqVaeConfig, places: int) -> None:
         super().__init__()
         self.config = config
         first, second = config.channels
@@ -53,7 +57,8 @@ class VqVae(nn.Module):
         )
         self.register_buffer("mean", torch.zeros(3, *config.image_size))
         self.register_buffer("std", torch.ones(3, 1, 1))
-        self.register_buffer("unit", torch.ones(()))
+        self.places = places
+        self.reader = Reader(self.latent_dim, places)
 
     @property
     def grid(self) -> tuple[int, int]:
@@ -66,6 +71,11 @@ class VqVae(nn.Module):
         """Components of an image's latent: 108 for the paper's 3 x 6 x 6."""
         rows, columns = self.grid
         return self.config.latent_channels * rows * columns
+
+    @property
+    def seen_dim(self) -> int:
+        """Components of what an agent sees of an image."""
+        return self.latent_dim + self.places
 
     def standardise(self, images: Tensor) -> Tensor:
         """Return (B, H, W, 3) uint8 RGB images as the networks see them, (B, 3, H, W) float32."""
@@ -95,7 +105,14 @@ class VqVae(nn.Module):
 
     def embed(self, index: Tensor) -> Tensor:
         """Return the latents (B, latent_dim) of (B, cells) indices, cell after cell."""
-        return (self.codebook.code[index] * self.unit).flatten(1)
+        return self.codebook.code[index].flatten(1)
+
+    @torch.no_grad()
+    def see(self, index: Tensor) -> Tensor:
+        """Return what an agent sees of (B, cells) indices, (B, seen_dim): the places in metres
+        that are read off the latent, and the latent."""
+        latent = self.embed(index)
+        return torch.cat([self.reader(latent), latent], 1)
 
     @torch.no_grad()
     def decode(self, latent: Tensor) -> Tensor:
@@ -104,18 +121,18 @@ class VqVae(nn.Module):
         Each cell is first put onto the code nearest to it, which leaves a latent of ``embed`` as
         it is and makes a picture of one that a generator proposed.
         """
-        cells = latent.view(-1, self.config.latent_channels) / self.unit
+        cells = latent.reshape(-1, self.config.latent_channels)
         return self.picture(self.decode_cells(self.codebook.code[self.codebook.nearest(cells)]))
 
     def fingerprint(self) -> str:
         """Return a key of the weights: what was encoded by another model is of another key.
 
-        The unit is left out, for codes do not depend on it.
+        The reader is left out, for codes do not depend on it.
         """
         digest = hashlib.sha256(json.dumps(to_plain(self.config)).encode())
-        weights = {name: value for name, value in self.state_dict().items() if name != "unit"}
-        for name, tensor in sorted(weights.items()):
-            digest.update(name.encode() + tensor.cpu().contiguous().numpy().tobytes())
+        for name, tensor in sorted(self.state_dict().items()):
+            if not name.startswith("reader."):
+                digest.update(name.encode() + tensor.cpu().contiguous().numpy().tobytes())
         return digest.hexdigest()[:16]
 
     def set_moments(self, mean: Tensor, std: Tensor) -> None:

@@ -20,7 +20,7 @@ def _paper(root: Path, output_dir: Path) -> VqVaeTrainConfig:
     return VqVaeTrainConfig(
         dataset=DatasetConfig(root),
         output_dir=output_dir,
-        model=VqVaeConfig(channels=(64, 128)),
+        model=VqVaeConfig(channels=(64, 128), reading=0.0),
         updates=1_000_000,
         batch_size=256,
         lr=1e-4,

@@ -9,10 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from eisp_data.storage.cache import DatasetArrays
+from vqvae.reading import on_table
 
 _RIDGE = 1.0
-_ON_TABLE_M = 0.6
-"""Further from the robot's base than this, or below the table, nothing is in the picture."""
 _MOST_ROWS = 200_000
 """Cells x K weights are to be found from them."""
 _ITERATIONS, _ACCURACY, _TINY = 100, 1e-3, 1e-30
@@ -54,7 +53,7 @@ def probe(
     found = {}
     for index, name in enumerate(names):
         place = np.asarray(places[:, index], np.float64)
-        seen = (np.abs(place).max(1) < _ON_TABLE_M) & (place[:, 2] > 0.0)
+        seen = on_table(place)
         fit, held = (_thin(part[seen[part]]) for part in (rows, held_rows))
         truth = place[held] - place[fit].mean(0)
         centred = place[fit] - place[fit].mean(0)

@@ -53,7 +53,7 @@ def load(path: Path) -> tuple[VqVae, VisionConfig]:
 
     config = load_config(path)
     try:
-        model = VqVae(config.model)
+        model = VqVae(config.model, config.places)
         model.load_state_dict(load_file(find(path) / "model.safetensors"))
     except Exception as error:  # safetensors and torch each have errors of their own
         raise DataError(f"{path} holds no readable VQ-VAE: {one_line(error)}") from None

@@ -20,13 +20,13 @@ from eisp_data.runs.episodes import rows_of, split
 from eisp_data.runs.folder import begin_run, has_progress
 from eisp_data.runs.metrics import MetricsLog
 from eisp_data.storage.cache import DatasetArrays, load_arrays, load_images
-from vqvae import saved
-from vqvae.calibrate import calibrate
+from vqvae import reading, saved
 from vqvae.config import VisionConfig, VqVaeTrainConfig
-from vqvae.latents import check_images, load_codes
+from vqvae.latents import check_images, load_codes, see
 from vqvae.losses import loss
 from vqvae.model import STRIDE, VqVae
 from vqvae.quality import Quality, measure
+from vqvae.reading import on_table
 
 CONFIG_FILE = "vqvae.yaml"
 _VALIDATION_IMAGES = 2048
@@ -42,14 +42,20 @@ def train(config: VqVaeTrainConfig) -> tuple[Path, Quality]:
     torch.set_num_threads(config.threads)
     images, arrays, episodes, held_episodes = load_frames(config)
     train_rows, held_rows = rows_of(arrays, episodes), rows_of(arrays, held_episodes)
+    # What has fallen off the table is in no picture.
+    train_rows = train_rows[on_table(arrays.achieved_goal[train_rows])]
+    if not len(train_rows):
+        raise DataError(f"{config.dataset.root}: in no frame all objects are on the table")
+    places = np.ascontiguousarray(arrays.achieved_goal, np.float32)
     torch.manual_seed(config.seed)
     rng = np.random.default_rng(config.seed)
-    model = VqVae(config.model)
+    model = VqVae(config.model, arrays.spec.goal_dim)
     model.set_moments(*moments(images[spread(train_rows, _MOMENT_IMAGES)]))
+    model.reader.set_moments(places[train_rows])
     model.to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=config.lr, fused=True)
     begin_run(run, config, CONFIG_FILE)
-    vision = VisionConfig(arrays.spec.task, config.dataset.camera, config.model)
+    vision = VisionConfig(arrays.spec.task, config.dataset.camera, config.model, model.places)
     done, spent = 0, 0.0
     if resumed:
         folder = run / "checkpoints" / "last" / MODEL
@@ -66,13 +72,15 @@ def train(config: VqVaeTrainConfig) -> tuple[Path, Quality]:
         optimizer.param_groups[0]["lr"] = learning_rate(config, update)
         # Sorted, for the images are mapped from a file.
         rows = np.sort(train_rows[rng.integers(len(train_rows), size=config.batch_size)])
-        info, fresh = step(model, optimizer, torch.from_numpy(images[rows]), device, config.fast)
+        batch = torch.from_numpy(images[rows]), torch.from_numpy(places[rows])
+        info, fresh = step(model, optimizer, *batch, device, config.fast)
         revived += fresh
         if update % config.validate_every == 0 or update == config.updates:
             quality = measure(model, held)
             if update == config.updates:
                 codes = load_codes(config.dataset.root, model, config.dataset.camera)
-                calibrate(model, codes, arrays, episodes)
+                latents = see(model, codes[train_rows])[:, model.places :]
+                reading.learn(model.reader, latents, places[train_rows], rng)
             bar.set_postfix(psnr=quality.psnr_db, used=quality.used)
             spent = time.monotonic() - start
             values: dict[str, float | Tensor] = {f"train/{k}": v for k, v in info.items()}
@@ -94,10 +102,16 @@ def train(config: VqVaeTrainConfig) -> tuple[Path, Quality]:
 
 
 def step(
-    model: VqVae, optimizer: torch.optim.Optimizer, images: Tensor, device: str, fast: bool
+    model: VqVae,
+    optimizer: torch.optim.Optimizer,
+    images: Tensor,
+    places: Tensor,
+    device: str,
+    fast: bool,
 ) -> tuple[dict[str, Tensor], int]:
-    """Update the model on (B, H, W, 3) images; return the losses and how many codes revived."""
-    total, info, assigned = loss(model, images.to(device), fast=fast)
+    """Update the model on (B, H, W, 3) images of objects at (B, P); return the losses and how many
+    codes revived."""
+    total, info, assigned = loss(model, images.to(device), places.to(device), fast=fast)
     optimizer.zero_grad(set_to_none=True)
     total.backward()
     optimizer.step()
@@ -126,6 +140,8 @@ def check(config: VqVaeTrainConfig) -> None:
         },
     )
     at_least(0, {"--seed": config.seed})
+    if not model.reading >= 0:
+        raise ConfigError(f"--model.reading must be at least 0; got {model.reading}")
     for flag, share in (
         ("--validation-share", config.validation_share),
         ("--model.decay", model.decay),

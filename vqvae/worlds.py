@@ -10,20 +10,21 @@ from eisp_data.sim.worlds import Worlds
 from eisp_data.tasks.base import GRIPPER_DIM, is_success
 from eisp_data.tasks.images import IMAGE_TASKS, goal_state
 from vqvae.config import VisionConfig
-from vqvae.latents import embed, encode
+from vqvae.latents import encode, observe, see
 from vqvae.model import VqVae
 
 
 class ImageWorlds(Worlds):
     """N worlds of an image task.
 
-    The observation is the robot's own part and the latent of a camera image; the achieved goal is
-    that latent, the desired goal that of a picture of the goal. Success and reward are those of
-    the worlds themselves: Eq. (1) on the places of block and handle, which the policy never sees.
+    Of a camera image the places that are read off its latent, and the latent, are seen: that is the
+    achieved goal, and of a picture of the goal the desired one. For the observation see
+    ``vqvae.latents.observe``. Success and reward are those of the worlds themselves: Eq. (1) on the
+    true places of block and handle, which the policy never sees.
 
     Attributes:
         place: (N, 6) float32, what the goal wants in metres.
-        desired_goal: (N, latent_dim) float32.
+        desired_goal: (N, seen_dim) float32.
     """
 
     def __init__(
@@ -37,8 +38,8 @@ class ImageWorlds(Worlds):
         self._name, self._model = name, model
         self._pixels = Pixels(self.task, config.camera, *config.model.image_size)
         self.place = self.desired_goal
-        self.desired_goal = np.zeros((count, model.latent_dim), np.float32)
-        self._latent: np.ndarray | None = None
+        self.desired_goal = np.zeros((count, model.seen_dim), np.float32)
+        self._seen: np.ndarray | None = None
 
     def restore(
         self, state: np.ndarray, desired_goal: np.ndarray, worlds: np.ndarray | None = None
@@ -50,12 +51,12 @@ class ImageWorlds(Worlds):
         self.steps[indices] = 0
         goals = np.stack([goal_state(self._image_task, goal) for goal in desired_goal])
         self.desired_goal[indices] = self._see(goals)
-        self._latent = None
+        self._seen = None
 
     def step(self, action: np.ndarray) -> None:
         """Apply (N, A) actions for one control period."""
         super().step(action)
-        self._latent = None
+        self._seen = None
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return all that ``restore_snapshot`` needs to go on from here."""
@@ -64,7 +65,7 @@ class ImageWorlds(Worlds):
     def restore_snapshot(self, arrays: dict[str, np.ndarray]) -> None:
         """Go on from a snapshot."""
         super().restore_snapshot(arrays)
-        self.place, self._latent = arrays["place"], None
+        self.place, self._seen = arrays["place"], None
 
     def images(self) -> np.ndarray:
         """Return what the camera sees, (N, H, W, 3) uint8."""
@@ -77,16 +78,16 @@ class ImageWorlds(Worlds):
 
     @property
     def observation(self) -> np.ndarray:
-        """(N, 10 + latent_dim) float32."""
+        """(N, 10 + 5 P + latent_dim) float32."""
         own = self.task.observe(self.state)[:, :GRIPPER_DIM]
-        return np.hstack([own, self.achieved_goal])
+        return observe(own, self.achieved_goal, self._model.places)
 
     @property
     def achieved_goal(self) -> np.ndarray:
-        """(N, latent_dim) float32."""
-        if self._latent is None:
-            self._latent = self._see(self.state)
-        return self._latent
+        """(N, seen_dim) float32."""
+        if self._seen is None:
+            self._seen = self._see(self.state)
+        return self._seen
 
     @property
     def success(self) -> np.ndarray:
@@ -94,4 +95,4 @@ class ImageWorlds(Worlds):
         return is_success(self.task.achieved_goal(self.state), self.place)
 
     def _see(self, states: np.ndarray) -> np.ndarray:
-        return embed(self._model, encode(self._model, self._pixels.draw(states)))
+        return see(self._model, encode(self._model, self._pixels.draw(states)))

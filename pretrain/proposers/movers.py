@@ -56,7 +56,7 @@ class Movers(SubgoalProposer):
         self.choice = MLP(pair, (width,), width)
         self.weight = MLP(layout.robot_dim + token + 2 * width, (width,), config.modes)
         self.moves = MLP(pair, (width, width), 7 * config.modes)
-        self.decoder = MLP(layout.observation_dim + layout.goal_dim, (width,) * 2, layout.goal_dim)
+        self.decoder = MLP(layout.observation_dim + 3 * count, (width,) * 2, 3 * count)
         self.register_buffer("_same", torch.eye(count))
 
     def components(self, observation: Tensor, goal: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -40,7 +40,7 @@ def test_the_layout_covers_the_goal_and_leaves_the_robot_its_part(name):
 def test_objects_of_a_kind_may_change_names(name):
     layout = LAYOUTS[name]
     observation, goal = scene(name, 64)
-    features = ObjectFeatures(layout)
+    features = ObjectFeatures(layout, empty_moments(layout))
     expected = features(observation, goal)
     assert expected.shape == (64, features.size)
     for shift in range(1, len(layout.objects)):
@@ -52,7 +52,7 @@ def test_objects_of_a_kind_may_change_names(name):
 def test_objects_of_different_kinds_keep_their_places(name):
     layout = LAYOUTS[name]
     observation, goal = scene(name, 64)
-    features = ObjectFeatures(layout)(observation, goal)
+    features = ObjectFeatures(layout, empty_moments(layout))(observation, goal)
     count = len(layout.objects)
     tokens = features[:, layout.robot_dim : layout.robot_dim + TOKEN * count]
     torch.testing.assert_close(tokens, object_tokens(layout, observation, goal).flatten(1))
@@ -66,7 +66,7 @@ def test_the_object_with_the_longest_way_comes_first_and_then_its_neighbours(nam
     layout = LAYOUTS[name]
     observation, goal = scene(name, 64)
     tokens = object_tokens(layout, observation, goal)
-    features = ObjectFeatures(layout)(observation, goal)
+    features = ObjectFeatures(layout, empty_moments(layout))(observation, goal)
     count = len(layout.objects)
     seen = features[:, layout.robot_dim : layout.robot_dim + TOKEN * count].view(64, count, TOKEN)
     longest = tokens[..., 6:9].norm(dim=-1).argmax(1)
@@ -79,7 +79,7 @@ def test_the_object_with_the_longest_way_comes_first_and_then_its_neighbours(nam
 def test_a_cube_looks_the_same_after_a_quarter_turn_but_not_after_half_of_one(name):
     layout = LAYOUTS[name]
     observation, goal = scene(name, 16)
-    features = ObjectFeatures(layout)
+    features = ObjectFeatures(layout, empty_moments(layout))
     expected = features(observation, goal)
     for item in layout.objects:
         turned = observation.clone()
@@ -93,7 +93,7 @@ def test_a_cube_looks_the_same_after_a_quarter_turn_but_not_after_half_of_one(na
 def test_features_stay_small_whatever_is_seen(name):
     layout = LAYOUTS[name]
     observation, goal = scene(name, 16)
-    far = ObjectFeatures(layout)(observation, goal + 1e4)
+    far = ObjectFeatures(layout, empty_moments(layout))(observation, goal + 1e4)
     assert far.isfinite().all()
     tokens = far[:, layout.robot_dim : layout.robot_dim + TOKEN * len(layout.objects)]
     assert tokens.abs().amax() <= 10
@@ -110,3 +110,20 @@ def test_plain_features_are_standardised():
     found = features(torch.tensor([[2.0, 6.0, 3.0]]), torch.tensor([[0.0, 9.0]]))
     torch.testing.assert_close(found, torch.tensor([[1.0, 2.0, 0.0, 2.0, 10.0]]))
     assert features.size == 5
+
+
+@pytest.mark.parametrize("name", MIXED)
+def test_an_image_adds_its_latent_and_of_a_goal_only_the_places_count(name):
+    plain, layout = LAYOUTS[name], LAYOUTS[name].seen(108)
+    moments = empty_moments(layout)
+    moments["observation_mean"] += 1.0
+    observation, goal = scene(name, 16)
+    latent = torch.rand(16, 108)
+    end = layout.observation_dim - 108
+    seen = torch.cat([observation[:, :end], latent], 1)
+    features = ObjectFeatures(layout, moments)
+    found = features(seen, torch.cat([goal, torch.rand(16, 108)], 1))
+    assert found.shape == (16, features.size)
+    expected = ObjectFeatures(plain, empty_moments(plain))(observation, goal)
+    assert torch.equal(found[:, :-108], expected)
+    assert torch.equal(found[:, -108:], latent - 1.0)

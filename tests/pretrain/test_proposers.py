@@ -14,6 +14,7 @@ from pretrain.config import AgentConfig, HybridConfig, MoversConfig
 from pretrain.layout import Layout
 from pretrain.proposers.hybrid import Hybrid
 from pretrain.proposers.movers import Movers
+from pretrain.proposers.pictured import PicturedMovers
 
 GENERATORS = ("movers", "hybrid")
 LAYOUTS = {name: Layout.of(task) for name, task in TASKS.items()}
@@ -190,3 +191,46 @@ def test_the_hybrid_weights_its_losses_as_eq_14_does():
         torch.testing.assert_close(loss.detach(), hybrid - beta * info["log_likelihood"])
         found.append(info["log_likelihood"])
     torch.testing.assert_close(*found)
+
+
+def imagined(task: str, count: int):
+    """Return the generator of an image task, and what it is asked about: latents are their row."""
+    layout = LAYOUTS[task].seen(4)
+    observation, goal = scene(task, count)
+    latent = torch.randn(count, 4)
+    seen = torch.cat([observation[:, : layout.observation_dim - 4], latent], 1)
+    proposer = PicturedMovers(layout, empty_moments(layout), MoversConfig(width=16))
+    return proposer, seen, torch.cat([goal, latent], 1)
+
+
+def test_a_subgoal_seen_in_an_image_has_places_as_for_states_and_a_latent():
+    torch.manual_seed(0)
+    proposer, observation, goal = imagined("store", 5)
+    drawn, log_prob = proposer.propose(observation, goal, 8)
+    assert drawn.shape == (5, 8, 10) and log_prob.shape == (5, 8)
+    plain = Movers(LAYOUTS["store"], MoversConfig(width=16))
+    state = torch.cat([observation[:, :-4], torch.zeros(5, 2)], 1)
+    shared = {k: v for k, v in proposer.state_dict().items() if k in plain.state_dict()}
+    shared |= {k: v for k, v in plain.state_dict().items() if k.startswith("decoder")}
+    plain.load_state_dict(shared)
+    expected, weight = plain.propose(state, goal[:, :6], 8)
+    torch.testing.assert_close(drawn[..., :6], expected)
+    torch.testing.assert_close(log_prob, weight)
+    assert drawn[..., 6:].std(1).min() > 0, "each candidate looks different"
+
+
+def test_a_generator_learns_what_a_subgoal_looks_like():
+    torch.manual_seed(0)
+    proposer, observation, goal = imagined("open_drawer", 64)
+    # It looks as it does now but where the block will be.
+    subgoal = goal.clone()
+    subgoal[:, 6:] = observation[:, -4:] + 3 * subgoal[:, :1]
+    optimizer = torch.optim.Adam(proposer.parameters(), lr=5e-3)
+    errors = []
+    for _ in range(200):
+        loss, info = proposer.loss(observation, goal, subgoal)
+        errors.append(float(info["picture_error"]))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert errors[-1] < 0.02 * errors[0]

@@ -227,6 +227,25 @@ def test_waypoints_are_where_objects_rest_whatever_the_goals_look_like():
     np.testing.assert_array_equal(seen.waypoints.row, trajectories().waypoints.row)
 
 
+def test_what_an_image_looks_like_is_no_part_of_its_distance():
+    layout = Layout(2, 9 + 4, 1, latent_dim=4)
+    paths = [path_of(OBJECTS, each) for each in EPISODES]
+    starts = np.cumsum([0, *map(len, paths)])
+    looks = np.random.default_rng(0).random((starts[-1], 4), np.float32)
+    goals = np.hstack([np.concatenate(paths), looks])
+    data = Trajectories(layout, 10**6, None, purposeful=True)
+    data.extend(looks[:, :2], goals, looks[:, :1], goals, starts, goals[:, :9])
+    batch = data.transitions(COUNT, replace(FUTURE, tolerance_m=0.02), np.random.default_rng(0))
+    goal = batch.goal.numpy()
+    here = [(looks == row).all(1).argmax() for row in goal[:, 9:]]
+    assert (looks[here] == goal[:, 9:]).all(), "latents of goals are left as they are"
+    assert not (goals[here, :9] == goal[:, :9]).all(), "places are jittered"
+    after = [(looks[:, :2] == row).all(1).argmax() for row in batch.next_observation.numpy()]
+    near = np.linalg.norm(goals[after, :9] - goal[:, :9], axis=1) <= 0.02
+    assert 0 < near.sum() < COUNT
+    assert (batch.reward.numpy() == near - 1.0).all()
+
+
 def test_pursued_goals_are_exactly_those_of_the_row_and_never_cloned():
     batch, rows, goal = draw(trajectories(), PURSUED)
     np.testing.assert_array_equal(goal, np.repeat(100.0 + rows[:, None], goal.shape[1], axis=1))

@@ -14,7 +14,7 @@ from eisp_data.sim.worlds import Worlds
 from eisp_data.storage.cache import load_arrays, load_images
 from eisp_data.tasks.base import is_success
 from eisp_data.tasks.images import IMAGE_TASKS, goal_state, image_task, state_task
-from vqvae.latents import embed, encode
+from vqvae.latents import encode, observe, see
 from vqvae.saved import load
 from vqvae.worlds import ImageWorlds
 
@@ -55,8 +55,9 @@ def test_what_is_seen_is_the_latent_of_the_image_and_new_after_a_step(worlds, vq
     model, _ = load(vqvae_run)
     worlds.reset([3, 4])
     first = worlds.achieved_goal
-    assert np.array_equal(first, embed(model, encode(model, worlds.images())))
-    assert np.array_equal(worlds.observation[:, 10:], first)
+    assert np.array_equal(first, see(model, encode(model, worlds.images())))
+    seen = observe(worlds.observation[:, :10], first, model.places)
+    assert np.array_equal(worlds.observation, seen)
     for _ in range(15):
         worlds.step(np.tile([-1.0, 1.0, -1.0, 0.0], (2, 1)))
     assert not np.array_equal(first, worlds.achieved_goal)

@@ -9,6 +9,8 @@ import pytest
 
 from eisp_data.errors import DataError
 from eisp_data.storage.cache import load_arrays, load_images
+from eisp_data.tasks.registry import get_task
+from pretrain.layout import Layout
 from vqvae import latents
 from vqvae.saved import load
 
@@ -35,13 +37,28 @@ def test_an_image_task_sees_the_robot_and_latents_and_no_object(images, vqvae_ru
     seen, states = latents.load_latent_arrays(images, model, vision), load_arrays(images)
     codes = latents.load_codes(images, model, vision.camera)
     assert seen.spec.task == "open_drawer_image"
-    assert (seen.spec.observation_dim, seen.spec.goal_dim) == (10 + 108, 108)
+    assert (seen.spec.observation_dim, seen.spec.goal_dim) == (10 + 2 * 15 + 108, 6 + 108)
     assert np.array_equal(seen.observation[:, :10], states.observation[:, :10])
-    assert np.array_equal(seen.observation[:, 10:], latents.embed(model, codes))
-    assert np.array_equal(seen.achieved_goal, latents.embed(model, codes))
-    assert seen.desired_goal.shape == (4, 108)
+    assert np.array_equal(seen.observation[:, 40:], latents.see(model, codes)[:, 6:])
+    assert np.array_equal(seen.achieved_goal, latents.see(model, codes))
+    assert seen.desired_goal.shape == (4, 114)
     for name in ("action", "reward", "success", "episode_start"):
         assert np.array_equal(getattr(seen, name), getattr(states, name))
+
+
+def test_what_is_seen_is_laid_out_as_the_states_are():
+    task = get_task("store")
+    state = np.stack([task.reset(np.random.default_rng(seed))[0] for seed in (0, 1)])
+    truth = task.observe(state)
+    seen = np.hstack([task.achieved_goal(state), np.full((2, 108), 7.0)])
+    observation = latents.observe(truth[:, :10], seen, 6)
+    layout = Layout.of(task)
+    assert observation.shape[1] == layout.seen(108).observation_dim
+    assert (observation[:, -108:] == 7.0).all()
+    for item in layout.objects:
+        shown = slice(item.observation, item.observation + 6)
+        np.testing.assert_allclose(observation[:, shown], truth[:, shown], atol=1e-6)
+        assert not observation[:, item.observation + 6 : item.observation + 15].any()
 
 
 def test_a_dataset_of_another_task_is_refused(images, vqvae_run):

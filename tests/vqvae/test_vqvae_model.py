@@ -12,7 +12,7 @@ from vqvae.model import VqVae
 @pytest.fixture
 def model() -> VqVae:
     torch.manual_seed(0)
-    made = VqVae(VqVaeConfig(channels=(4, 8), codes=40))
+    made = VqVae(VqVaeConfig(channels=(4, 8), codes=40), 6)
     made.codebook.code.normal_()
     return made
 
@@ -46,12 +46,12 @@ def test_a_latent_beside_a_code_is_decoded_as_that_code(model, images):
     assert torch.equal(model.decode(latent + 1e-4 * torch.randn_like(latent)), model.decode(latent))
 
 
-def test_the_unit_scales_latents_and_leaves_images(model, images):
+def test_what_is_seen_is_the_latent_and_the_places_that_are_read_off_it(model, images):
     index = model.encode(images)
-    latent, image = model.embed(index), model.decode(model.embed(index))
-    model.unit.fill_(0.25)
-    assert torch.allclose(model.embed(index), 0.25 * latent)
-    assert torch.equal(model.decode(model.embed(index)), image)
+    seen, latent = model.see(index), model.embed(index)
+    assert seen.shape == (5, model.seen_dim) and model.seen_dim == 108 + 6
+    assert torch.equal(seen[:, 6:], latent)
+    assert torch.equal(seen[:, :6], model.reader(latent))
 
 
 def test_standardising_and_picturing_are_inverse(model, images):
@@ -67,4 +67,4 @@ def test_the_fingerprint_is_that_of_the_weights(model):
 
 
 def test_larger_images_have_more_cells():
-    assert VqVae(VqVaeConfig(image_size=(64, 48), channels=(4, 4))).grid == (8, 6)
+    assert VqVae(VqVaeConfig(image_size=(64, 48), channels=(4, 4)), 6).grid == (8, 6)

@@ -92,6 +92,7 @@ def test_the_learning_rate_falls_to_its_share():
         ({"batch_size": 0}, "--batch-size must be at least 1; got 0"),
         ({"validation_share": 1.0}, "--validation-share must be between 0 and 1; got 1.0"),
         ({"model": replace(TINY, image_size=(48, 50))}, "multiples of 8; got 48 x 50"),
+        ({"model": replace(TINY, reading=-1.0)}, "--model.reading must be at least 0; got -1.0"),
         ({"model": replace(TINY, codes=0)}, "--model.codes must be at least 1; got 0"),
     ],
 )
