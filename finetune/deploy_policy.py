@@ -62,11 +62,7 @@ class PolicyController:
         self.at_subgoal = self._begun and bool(self._rollout.reached(achieved)[0])
         self._begun = True
         action = self._rollout.act(seen.observation[None], achieved, self._goal[None])[0]
-        subgoal = self._rollout.subgoal[0].copy()
-        if np.array_equal(subgoal, achieved[0]):
-            # It rests where the goal is met: that is no new subgoal at each step.
-            subgoal = self._goal.copy()
-        return Decision(action.astype(float), subgoal=subgoal)
+        return Decision(action.astype(float), subgoal=self._rollout.subgoal[0].copy())
 
 
 class Looking:

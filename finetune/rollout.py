@@ -77,16 +77,16 @@ class SubgoalPolicy:
         if len(renew):
             self._notice_stuck(renew, reached, achieved_goal)
             self._renew(renew, observation, achieved_goal, desired_goal)
-        # Nothing is left to correct but large errors: the hand lets go.
         self.subgoal[done], self.stuck[done] = desired_goal[done], False
+        # Nothing is left to correct but large errors: the hand lets go of what is well enough.
         well = done & (missed <= self._config.final_m / 2)
-        self.subgoal[well] = achieved_goal[well]
+        target = np.where(well[:, None], achieved_goal, self.subgoal)
         self.age += 1
         self.idle += 1
-        action = self._act(observation, self.subgoal, noise)
+        action = self._act(observation, target, noise)
         stuck = np.flatnonzero(self.stuck)
         if len(stuck) and noise < 1:
-            action[stuck] = self._act(observation[stuck], self.subgoal[stuck], 1.0)
+            action[stuck] = self._act(observation[stuck], target[stuck], 1.0)
         # It would drift back and touch what it has built.
         action[done & (self.met > _REST_STEPS)] = 0.0
         return action

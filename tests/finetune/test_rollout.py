@@ -42,6 +42,11 @@ def step(policy: SubgoalPolicy, achieved=None, desired=FAR, noise: float = 0.0) 
     return policy.act(achieved, achieved, desired, noise)
 
 
+def towards(policy: SubgoalPolicy, achieved: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    """Return the low-level policy's actions where all is as achieved."""
+    return policy._agent.sac.act(torch.from_numpy(achieved), torch.from_numpy(goal)).numpy()
+
+
 def test_a_subgoal_lasts_for_t_steps():
     policy = counting_policy()
     seen = []
@@ -150,13 +155,16 @@ def test_where_the_final_goal_is_met_nobody_is_stuck_however_still():
 
 def test_where_the_final_goal_stays_met_it_is_kept_as_it_is_and_then_nothing_is_done():
     policy = counting_policy()
-    policy._agent.sac.actor.body[-1].bias.data[:] = 1.0
+    actor = policy._agent.sac.actor.body[-1]
+    actor.bias.data[:] = 1.0
+    actor.weight.data[:] = 3.0
     goal = np.zeros((2, 2), np.float32)
     places = np.array([[0.02, 0.0], [0.07, 0.0]], np.float32)
     actions = np.stack([step(policy, places, goal) for _ in range(40)])
     assert (actions[:30, 0] != 0).all() and (actions[30:, 0] == 0).all()
     assert (actions[:, 1] != 0).all()
-    np.testing.assert_array_equal(policy.subgoal[0], places[0])
+    assert not policy.subgoal[0].any(), "the goal stays what it is heading for"
+    assert (actions[15, 0] == towards(policy, places, places)[0]).all()
     # It begins anew as soon as the goal is no longer met.
     step(policy, places + 0.04, goal)
     assert policy.met.tolist() == [0, 0] and policy.subgoal[0, 0] >= 1.0
@@ -164,10 +172,14 @@ def test_where_the_final_goal_stays_met_it_is_kept_as_it_is_and_then_nothing_is_
 
 def test_a_goal_that_is_met_only_just_is_still_corrected():
     policy = counting_policy()
+    policy._agent.sac.actor.body[-1].weight.data[:] = 1.0
     goal = np.zeros((2, 2), np.float32)
+    places = np.array([[0.04, 0.0], [0.02, 0.0]], np.float32)
     for _ in range(20):
-        step(policy, np.array([[0.04, 0.0], [0.02, 0.0]], np.float32), goal)
-    assert policy.subgoal[:, 0].tolist() == [0.0, pytest.approx(0.02)]
+        action = step(policy, places, goal)
+    to_goal, to_stay = towards(policy, places, goal), towards(policy, places, places)
+    assert (to_goal != to_stay).any(1).all()
+    assert (action[0] == to_goal[0]).all() and (action[1] == to_stay[1]).all()
 
 
 def test_a_policy_that_finds_all_as_it_should_be_for_long_is_idle():
