@@ -42,6 +42,7 @@ def tiny_training(root: Path, output_dir: Path, **changes: object) -> VqVaeTrain
     values: dict[str, object] = {
         "model": TINY,
         "updates": 160,
+        "reader_updates": 300,
         "validate_every": 40,
         "batch_size": 16,
         "lr": 5e-3,

@@ -22,7 +22,7 @@ class VqVaeConfig:
     """K, the size of the codebook; the paper does not give it."""
     commitment: float = 0.25
     """Weight of the commitment loss (beta of van den Oord et al. 2017)."""
-    reading: float = 0.1
+    reading: float = 0.3
     """Weight of the distance in decimetres between where the objects were and where the reader
     reads them; 0 teaches the reader alone, as the paper's VQ-VAE knows no places."""
     decay: float = 0.99
@@ -62,7 +62,9 @@ class VqVaeTrainConfig:
     output_dir: Path
     """Where the run goes."""
     model: VqVaeConfig = field(default_factory=VqVaeConfig)
-    updates: int = 12_000
+    updates: int = 16_000
+    reader_updates: int = 8_000
+    """After these the codes stay as they are, and so many updates the reader alone learns on."""
     batch_size: int = 256
     lr: float = 1e-3
     """Of Adam at the start."""

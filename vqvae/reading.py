@@ -21,7 +21,7 @@ from eisp_data.storage.cache import DatasetArrays
 from eisp_data.tasks.base import SUCCESS_DISTANCE_M
 
 _WIDTH = 256
-_UPDATES, _BATCH, _LR = 8_000, 512, 1e-3
+_BATCH, _LR = 512, 1e-3
 _LEAST_STD = 1e-3
 _ON_TABLE_M = 0.6
 """Further from the robot's base than this, or below the table, nothing is in the picture."""
@@ -67,15 +67,19 @@ class Reader(nn.Module):
 
 
 def learn(
-    reader: Reader, latents: np.ndarray, places: np.ndarray, rng: np.random.Generator
+    reader: Reader,
+    latents: np.ndarray,
+    places: np.ndarray,
+    updates: int,
+    rng: np.random.Generator,
 ) -> None:
     """Learn on to read places (N, P) in metres off latents (N, latent_dim), which stay as they
     are."""
     device = reader.centre.device
     seen, truth = (torch.from_numpy(part).to(device) for part in (latents, places))
     optimizer = torch.optim.Adam(reader.layers.parameters(), lr=_LR, fused=True)
-    for update in range(_UPDATES):
-        optimizer.param_groups[0]["lr"] = _LR * 0.5 * (1.0 + math.cos(math.pi * update / _UPDATES))
+    for update in range(updates):
+        optimizer.param_groups[0]["lr"] = _LR * 0.5 * (1.0 + math.cos(math.pi * update / updates))
         rows = torch.from_numpy(rng.integers(len(seen), size=_BATCH)).to(device)
         optimizer.zero_grad(set_to_none=True)
         reader.loss(seen[rows], truth[rows]).backward()

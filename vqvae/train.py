@@ -80,7 +80,8 @@ def train(config: VqVaeTrainConfig) -> tuple[Path, Quality]:
             if update == config.updates:
                 codes = load_codes(config.dataset.root, model, config.dataset.camera)
                 latents = see(model, codes[train_rows])[:, model.places :]
-                reading.learn(model.reader, latents, places[train_rows], rng)
+                known = places[train_rows]
+                reading.learn(model.reader, latents, known, config.reader_updates, rng)
             bar.set_postfix(psnr=quality.psnr_db, used=quality.used)
             spent = time.monotonic() - start
             values: dict[str, float | Tensor] = {f"train/{k}": v for k, v in info.items()}
@@ -131,6 +132,7 @@ def check(config: VqVaeTrainConfig) -> None:
         1,
         {
             "--updates": config.updates,
+            "--reader-updates": config.reader_updates,
             "--batch-size": config.batch_size,
             "--validate-every": config.validate_every,
             "--threads": config.threads,

@@ -6,7 +6,6 @@ import numpy as np
 import torch
 
 from eisp_data.storage.cache import load_arrays
-from vqvae import reading
 from vqvae.latents import load_codes, see
 from vqvae.reading import Reader, check, learn, on_table
 from vqvae.saved import load
@@ -14,15 +13,14 @@ from vqvae.saved import load
 RNG = np.random.default_rng(0)
 
 
-def test_a_place_that_bends_with_the_latent_is_read_to_the_millimetre(monkeypatch):
-    monkeypatch.setattr(reading, "_UPDATES", 1500)
+def test_a_place_that_bends_with_the_latent_is_read_to_the_millimetre():
     torch.manual_seed(0)
     latents = RNG.uniform(-1, 1, (4000, 4)).astype(np.float32)
     places = 0.3 + 0.2 * np.stack([latents[:, 0] * latents[:, 1], latents[:, 2] ** 2], 1)
     places = np.hstack([places, np.full((4000, 1), 0.1)]).astype(np.float32)
     reader = Reader(4, 3)
     reader.set_moments(places)
-    learn(reader, latents[:3000], places[:3000], np.random.default_rng(0))
+    learn(reader, latents[:3000], places[:3000], 1500, np.random.default_rng(0))
     with torch.no_grad():
         apart = reader(torch.from_numpy(latents[3000:])).numpy() - places[3000:]
     assert np.linalg.norm(apart, axis=1).mean() < 0.005 < places[:, 0].std()
