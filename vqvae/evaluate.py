@@ -62,8 +62,8 @@ class VqVaeEvaluation:
             for name, mean in read.mean_mm.items()
         ]
         lines += [
-            f"read as within 5 cm       {read.found:.1%} of the pairs of frames that are, not "
-            f"{read.rejected:.1%} of the others",
+            f"read as within 5 cm       {read.found:.1%} of the pairs of frames that are, "
+            f"{1.0 - read.rejected:.1%} of the others",
             f"within 5 cm               {read.right:.1%} of the pairs that are read as such",
         ]
         return "\n".join(lines)
