@@ -43,8 +43,7 @@ class Layout:
 
     def apart(self, goals: Goals, others: Goals) -> Goals:
         """Return the way between (..., G) goals: what their distance is the norm of."""
-        count = self.goal_dim - self.latent_dim
-        return goals[..., :count] - others[..., :count]
+        return goals[..., : self.places_dim] - others[..., : self.places_dim]
 
     @classmethod
     def of(cls, task: Task) -> Layout:
@@ -70,6 +69,11 @@ class Layout:
             goal_dim=self.goal_dim + latent_dim,
             latent_dim=latent_dim,
         )
+
+    @property
+    def places_dim(self) -> int:
+        """How many components of a goal, from the first on, count in its distance."""
+        return self.goal_dim - self.latent_dim
 
     @property
     def kinds(self) -> int:

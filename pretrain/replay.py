@@ -169,7 +169,7 @@ class Trajectories:
         Goals taken from a trajectory are met exactly, those of a rollout never: what is done well
         enough must look done, and not like a place to correct.
         """
-        places = goal[:, : self._layout.goal_dim - self._layout.latent_dim]
+        places = goal[:, : self._layout.places_dim]
         std = mix.tolerance_m / (2.0 * places.shape[1] ** 0.5)
         places += rng.standard_normal(places.shape, np.float32) * np.float32(std)
 

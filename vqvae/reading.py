@@ -102,7 +102,7 @@ class Reading:
     found: float
     """Share of the pairs of frames within 5 cm that are read as such."""
     rejected: float
-    """Share of the other pairs that are read as such."""
+    """Share of the other pairs that are not."""
     right: float
     """Share of the pairs that are read as within 5 cm and are."""
 

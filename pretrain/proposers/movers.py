@@ -25,7 +25,7 @@ from pretrain.networks import MLP
 from pretrain.proposers import laplace
 from pretrain.proposers.proposer import Info, SubgoalProposer
 
-_SCALE = 10.0
+SCALE = 10.0
 """Lengths are in decimetres inside the networks."""
 _LEAST_SCALE, _MOST_SCALE = 0.02, 2.0
 
@@ -93,7 +93,7 @@ class Movers(SubgoalProposer):
 
     def _relative(self, observation: Tensor, goal: Tensor) -> Tensor:
         """Return (B, n, 3): goals relative to where the objects are, decimetres."""
-        return (goal[:, self._columns] - self._place(observation)) * _SCALE
+        return (goal[:, self._columns] - self._place(observation)) * SCALE
 
     def _place(self, observation: Tensor) -> Tensor:
         return observation[:, self._places]
@@ -114,7 +114,7 @@ class Movers(SubgoalProposer):
             candidate = laplace.sample(chosen, spread)
             candidate[:, :movers] = chosen[:, :movers]
             log_prob = log_weight.gather(1, which)
-            places = self._place(observation)[:, None] + candidate / _SCALE
+            places = self._place(observation)[:, None] + candidate / SCALE
             result = goal[:, None].repeat(1, which.shape[1], 1)
             result[..., self._columns] = places
             return result, log_prob
@@ -133,10 +133,10 @@ class Movers(SubgoalProposer):
         share = joint.softmax(-1).detach()
         parts = self._of(mover, log_weight + laplace.evened(each, scales).sum(-1))
         learned = (share * parts).sum(-1)
-        drawn = self._place(observation)[:, None] * _SCALE + laplace.sample(mean, scale)
+        drawn = self._place(observation)[:, None] * SCALE + laplace.sample(mean, scale)
         state = observation[:, None].expand(-1, drawn.shape[1], -1)
         guess = self.decoder(torch.cat([state, drawn.flatten(2)], -1))
-        true_goal = goal[:, self._columns].flatten(1)[:, None] * _SCALE
+        true_goal = goal[:, self._columns].flatten(1)[:, None] * SCALE
         # A unit-scale Laplace in decimetres, constants dropped.
         missed = (guess - true_goal).abs().sum(-1)
         weight = log_weight.exp()

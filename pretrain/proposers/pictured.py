@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from pretrain.config import MoversConfig
 from pretrain.layout import Layout
 from pretrain.networks import MLP
-from pretrain.proposers.movers import Movers
+from pretrain.proposers.movers import SCALE, Movers
 from pretrain.proposers.proposer import Info
 
 _WIDTH = 256
@@ -36,16 +36,14 @@ class PicturedMovers(Movers):
         for name in ("mean", "std"):
             latent = moments[f"goal_{name}"][-layout.latent_dim :]
             self.register_buffer(f"latent_{name}", latent.clone())
-        places = layout.goal_dim - layout.latent_dim
-        self.picture = MLP(
-            layout.robot_dim + layout.latent_dim + 2 * places, (_WIDTH,) * 2, layout.latent_dim
-        )
+        inputs = layout.robot_dim + layout.latent_dim + 2 * layout.places_dim
+        self.picture = MLP(inputs, (_WIDTH,) * 2, layout.latent_dim)
 
     def propose(self, observation: Tensor, goal: Tensor, count: int) -> tuple[Tensor, Tensor]:
         """Draw candidates with their latents."""
         drawn, log_prob = super().propose(observation, goal, count)
         with torch.no_grad():
-            places = drawn[..., : -self._latent_dim]
+            places = drawn[..., : self._layout.places_dim]
             repeated = observation[:, None].expand(-1, drawn.shape[1], -1)
             latent = self._imagine(repeated, places) * self.latent_std + self.latent_mean
         return torch.cat([places, latent], -1), log_prob
@@ -53,7 +51,7 @@ class PicturedMovers(Movers):
     def loss(self, observation: Tensor, goal: Tensor, subgoal: Tensor) -> tuple[Tensor, Info]:
         """Return the loss of ``Movers`` and the error of the standardised latent."""
         total, info = super().loss(observation, goal, subgoal)
-        places, latent = subgoal.split([subgoal.shape[-1] - self._latent_dim, self._latent_dim], -1)
+        places, latent = subgoal.split([self._layout.places_dim, self._latent_dim], -1)
         true = (latent - self.latent_mean) / self.latent_std
         error = nn.functional.mse_loss(self._imagine(observation, places), true)
         return total + error, info | {"picture_error": error.detach()}
@@ -63,4 +61,4 @@ class PicturedMovers(Movers):
         robot = observation[..., : self._layout.robot_dim]
         latent = (observation[..., -self._latent_dim :] - self.latent_mean) / self.latent_std
         here = observation[..., self._places].flatten(-2)
-        return self.picture(torch.cat([robot, latent, here * 10.0, (places - here) * 10.0], -1))
+        return self.picture(torch.cat([robot, latent, here * SCALE, (places - here) * SCALE], -1))

@@ -34,7 +34,7 @@ def test_what_fell_off_the_table_or_lies_far_away_is_not_in_the_picture():
 
 def test_places_that_are_read_exactly_leave_no_doubt(images):
     arrays = load_arrays(images)
-    found = check(arrays.achieved_goal, arrays, np.arange(4), ["handle", "block"])
+    found = check(arrays.achieved_goal, arrays, np.arange(4), ["block", "handle"])
     assert found.mean_mm == found.percentile_95_mm == {"handle": 0.0, "block": 0.0}
     assert (found.found, found.rejected, found.right) == (1.0, 1.0, 1.0)
 
@@ -42,14 +42,14 @@ def test_places_that_are_read_exactly_leave_no_doubt(images):
 def test_places_that_are_never_told_apart_all_seem_near(images):
     arrays = load_arrays(images)
     constant = np.broadcast_to(arrays.achieved_goal.mean(0), arrays.achieved_goal.shape)
-    found = check(constant, arrays, np.arange(4), ["handle", "block"])
+    found = check(constant, arrays, np.arange(4), ["block", "handle"])
     assert (found.found, found.rejected) == (1.0, 0.0) and 0 < found.right < 1
 
 
 def test_training_teaches_the_reader(images, vqvae_run):
     model, vision = load(vqvae_run)
     arrays, codes = load_arrays(images), load_codes(images, model, vision.camera)
-    names = ["handle", "block"]
+    names = ["block", "handle"]
     seen = see(model, codes)
     assert seen.shape == (len(codes), 108 + 6)
     learned = check(seen[:, :6], arrays, np.arange(4), names)

@@ -124,18 +124,9 @@ def test_the_command_trains_and_evaluates(images, tmp_path, monkeypatch, capsys)
         return capsys.readouterr().out
 
     small = [
-        "--updates",
-        3,
-        "--reader-updates",
-        5,
-        "--batch-size",
-        4,
-        "--model.channels",
-        4,
-        4,
-        "--model.codes",
-        8,
-    ]
+        "--updates", 3, "--reader-updates", 5, "--batch-size", 4,
+        "--model.channels", 4, 4, "--model.codes", 8,
+    ]  # fmt: skip
     place = ["--dataset.root", images, "--output-dir", tmp_path / "run", "--threads", 1]
     said = run("train", *place, *small, "--validation-share", 0.25, "--device", "cpu")
     assert "PSNR" in said and f"model: {tmp_path / 'run/checkpoints/last'}" in said
