@@ -7,6 +7,7 @@ natively: twice as fast. Parameters, sums, losses and the last layer stay fp32.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -81,5 +82,29 @@ class EnsembleMLP(nn.Module):
                 hidden = nn.functional.layer_norm(hidden, hidden.shape[-1:])
                 hidden = torch.addcmul(shift, hidden, scale)
             hidden = torch.relu(hidden)
-        # Of a single column a product is slower than the sum that it is, backward above all.
-        return (hidden * last_weight.mT).sum(-1) + last_bias[:, 0]
+        single: Tensor = _SingleOutput.apply(hidden, last_weight)
+        return single + last_bias[:, 0]
+
+
+class _SingleOutput(torch.autograd.Function):
+    """The product with a single column, (M, B, K) by (M, K, 1), as the sum (M, B) that it is.
+
+    Summed and returned in the weights' type; gradients are worked out in that of the layers before.
+    That takes a third of the time.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, hidden: Tensor, weight: Tensor) -> Tensor:  # noqa: ANN401
+        ctx.save_for_backward(hidden, weight)
+        return (hidden * weight.mT).sum(-1)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None]:  # noqa: ANN401
+        hidden, weight = ctx.saved_tensors
+        gradient = gradients[0].to(hidden.dtype)
+        of_hidden = of_weight = None
+        if ctx.needs_input_grad[0]:
+            of_hidden = torch.bmm(gradient[..., None], weight.mT.to(hidden.dtype))
+        if ctx.needs_input_grad[1]:
+            of_weight = torch.bmm(gradient[:, None], hidden).mT.to(weight.dtype)
+        return of_hidden, of_weight

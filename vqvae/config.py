@@ -23,7 +23,7 @@ class VqVaeConfig:
     commitment: float = 0.25
     """Weight of the commitment loss (beta of van den Oord et al. 2017)."""
     reading: float = 0.3
-    """Weight of the distance in decimetres between where the objects were and where the reader
+    """Weight of the distances in decimetres between where the objects were and where the reader
     reads them; 0 teaches the reader alone, as the paper's VQ-VAE knows no places."""
     decay: float = 0.99
     """Of the moving averages that the codes follow (the same paper, its appendix A.1)."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 
 from eisp_data.storage.cache import load_arrays
@@ -24,6 +25,14 @@ def test_a_place_that_bends_with_the_latent_is_read_to_the_millimetre():
     with torch.no_grad():
         apart = reader(torch.from_numpy(latents[3000:])).numpy() - places[3000:]
     assert np.linalg.norm(apart, axis=1).mean() < 0.005 < places[:, 0].std()
+
+
+def test_the_loss_is_the_distance_of_both_from_the_truth():
+    reader = Reader(2, 6)
+    for part in reader.parameters():
+        part.data.zero_()
+    places = torch.tensor([[0.3, 0.4, 0.0, 0.0, 0.0, 0.1]])
+    assert reader.loss(torch.zeros(1, 2), places).item() == pytest.approx(2 * (5.0 + 1.0) / 2)
 
 
 def test_what_fell_off_the_table_or_lies_far_away_is_not_in_the_picture():
