@@ -36,7 +36,7 @@ def _cpu(root: Path, output_dir: Path) -> VqVaeTrainConfig:
         dataset=DatasetConfig(root),
         output_dir=output_dir,
         model=VqVaeConfig(channels=(32, 64)),
-        updates=16_000,
+        updates=18_000,
         batch_size=128,
         lr=2e-3,
     )

@@ -35,6 +35,17 @@ def test_the_members_of_an_ensemble_learn_apart():
         assert (parameter.grad[0] != 0).any() and (parameter.grad[1] == 0).all()
 
 
+def test_the_gradients_of_an_ensemble_are_those_of_small_differences():
+    torch.manual_seed(0)
+    ensemble = EnsembleMLP(2, 3, (4,), layer_norm=False).double()
+    inputs = torch.randn(5, 3, dtype=torch.float64, requires_grad=True)
+
+    def value(inputs: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
+        return ensemble(inputs).sin()
+
+    assert torch.autograd.gradcheck(value, (inputs, *ensemble.parameters()))
+
+
 def test_a_perceptron_without_hidden_layers_is_linear():
     assert [type(module) for module in MLP(3, (), 2)] == [nn.Linear]
     kinds = [nn.Linear, nn.ReLU, nn.Linear, nn.ReLU, nn.Linear]
