@@ -1,7 +1,7 @@
 """Multilayer perceptrons, single and in ensembles.
 
 Their hidden layers are bf16 where ``pretrain.device`` allows it and the processor multiplies it
-natively: twice as fast. Parameters, sums, losses and the last layer stay fp32.
+natively: twice as fast. Parameters, sums, losses and what the last layer gives stay fp32.
 """
 
 from __future__ import annotations

@@ -11,6 +11,8 @@ import torch
 from torch import Tensor, nn
 
 _SMOOTHING = 1e-5
+_ROWS = 256
+"""Whose distances to all codes are looked at together: they stay in a processor's cache."""
 
 
 class Codebook(nn.Module):
@@ -44,8 +46,12 @@ class Codebook(nn.Module):
     def nearest(self, vectors: Tensor) -> Tensor:
         """Return the indices (N,) of the codes nearest to (N, D) vectors."""
         # |v|^2 is the same for all codes.
-        apart = torch.addmm(self.code.square().sum(1), vectors, self.code.T, alpha=-2.0)
-        return apart.argmin(1)
+        square = self.code.square().sum(1)
+        parts = [
+            torch.addmm(square, part, self.code.T, alpha=-2.0).argmin(1)
+            for part in vectors.split(_ROWS)
+        ]
+        return torch.cat(parts)
 
     def forward(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
         """Return the codes (N, D) nearest to (N, D) vectors, and their indices (N,).

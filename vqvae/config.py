@@ -22,7 +22,7 @@ class VqVaeConfig:
     """K, the size of the codebook; the paper does not give it."""
     commitment: float = 0.25
     """Weight of the commitment loss (beta of van den Oord et al. 2017)."""
-    reading: float = 0.3
+    reading: float = 1.0
     """Weight of the distances in decimetres between where the objects were and where the reader
     reads them; 0 teaches the reader alone, as the paper's VQ-VAE knows no places."""
     decay: float = 0.99

@@ -31,14 +31,17 @@ def _paper(root: Path, output_dir: Path) -> VqVaeTrainConfig:
 
 
 def _cpu(root: Path, output_dir: Path) -> VqVaeTrainConfig:
-    """Half the width, half the batch, twenty times the learning rate, and that falling."""
+    """Half the width, half the batch, forty times the learning rate, and that falling.
+
+    In the same time these many codes and this rate make clearer images than wider networks.
+    """
     return VqVaeTrainConfig(
         dataset=DatasetConfig(root),
         output_dir=output_dir,
-        model=VqVaeConfig(channels=(32, 64)),
+        model=VqVaeConfig(channels=(32, 64), codes=4096),
         updates=18_000,
         batch_size=128,
-        lr=2e-3,
+        lr=4e-3,
     )
 
 
