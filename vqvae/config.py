@@ -62,7 +62,7 @@ class VqVaeTrainConfig:
     output_dir: Path
     """Where the run goes."""
     model: VqVaeConfig = field(default_factory=VqVaeConfig)
-    updates: int = 18_000
+    updates: int = 12_000
     reader_updates: int = 8_000
     """After these the codes stay as they are, and so many updates the reader alone learns on."""
     batch_size: int = 256

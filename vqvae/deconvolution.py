@@ -26,7 +26,8 @@ class _Double(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        [gradient] = gradients
+        # The loss gives it in another order; it is small, and all that follows is in this one.
+        gradient = gradients[0].contiguous(memory_format=torch.channels_last)
         inputs, weight = (saved.to(gradient.dtype) for saved in ctx.saved_tensors)
         _, by_weight, _ = torch.ops.aten.convolution_backward(
             inputs, gradient, weight, None, _STRIDE, _PADDING, (1, 1), False, (0, 0), 1,

@@ -18,6 +18,7 @@ from eisp_data.runs import MODEL, checkpoint
 from eisp_data.runs.device import choose_device
 from eisp_data.runs.episodes import rows_of, split
 from eisp_data.runs.folder import begin_run, has_progress
+from eisp_data.runs.memory import keep_freed_memory
 from eisp_data.runs.metrics import MetricsLog
 from eisp_data.storage.cache import DatasetArrays, load_arrays, load_images
 from vqvae import reading, saved
@@ -40,6 +41,7 @@ def train(config: VqVaeTrainConfig) -> tuple[Path, Quality]:
     resumed = has_progress(run, config.resume, CONFIG_FILE)
     device = choose_device(config.device)
     torch.set_num_threads(config.threads)
+    keep_freed_memory()
     images, arrays, episodes, held_episodes = load_frames(config)
     train_rows, held_rows = rows_of(arrays, episodes), rows_of(arrays, held_episodes)
     # What has fallen off the table is in no picture.
