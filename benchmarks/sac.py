@@ -7,19 +7,22 @@ on episodes of Stack's shapes. Ours is plain SAC as in ``--preset paper``: no la
 cloning. It is timed with its hidden layers in bf16, as it runs where the processor multiplies that
 natively, and in fp32. Our settings let oneDNN multiply fp32 instead of MKL, which is half as fast
 on an AMD processor. Stable-Baselines3 is timed as it comes and with that setting. On a processor
-without AMX the products stay fp32 by it: their error is printed. All take short turns one after the
-other, so that whatever else the machine does meets them alike; the rates are over the sums of the
-turns. Processor time, with ``--threads 1``, can be compared on a busy machine too. The limit is the
-arithmetic of one update at the rate at which oneDNN multiplies matrices of that size, fp32, on the
-same threads.
+without AMX the products stay fp32 by it: their error is printed. Each runs in a process of its own,
+as it would at work, and all take short turns one after the other, so that whatever else the machine
+does meets them alike; the rates are over the sums of the turns. Processor time, with ``--threads
+1``, can be compared on a busy machine too. The limit is the arithmetic of one update at the rate at
+which oneDNN multiplies matrices of that size, fp32, on the same threads.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import multiprocessing
+import os
 import time
 from collections.abc import Callable
 from importlib.util import find_spec
+from multiprocessing.connection import Connection
 from unittest import mock
 
 import gymnasium
@@ -34,6 +37,7 @@ from eisp_data.tasks.registry import get_task
 from pretrain import networks
 from pretrain.agent import BANK, Agent
 from pretrain.config import AgentConfig, GoalMix, SacConfig
+from pretrain.device import set_up
 from pretrain.layout import Layout
 from pretrain.learner import Learner
 from pretrain.replay import Trajectories
@@ -53,8 +57,8 @@ class Options:
     threads: int = 2
     episodes: int = 100
     """In the replay."""
-    turns: int = 6
-    turn_updates: int = 10
+    turns: int = 10
+    turn_updates: int = 30
 
 
 def episode(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -75,9 +79,12 @@ class Ours:
     """
 
     def __init__(
-        self, options: Options, layers: tuple[int, ...], hidden: Callable[[Tensor], torch.dtype]
+        self,
+        options: Options,
+        layers: tuple[int, ...],
+        hidden: Callable[[Tensor], torch.dtype] = networks.hidden_dtype,
     ) -> None:
-        self._hidden = hidden
+        networks.hidden_dtype = hidden
         rng = np.random.default_rng(0)
         layout = Layout(S, G, A)
         self._data = Trajectories(layout, 10**9, 4, purposeful=False)
@@ -87,22 +94,20 @@ class Ours:
         sac = SacConfig(layers=layers, layer_norm=False, clip_targets=False, cloning=0.0)
         config = AgentConfig("stack", features="plain", generator="hybrid", sac=sac)
         agent = Agent(config, layout, self._data.moments(), torch.zeros(BANK, G))
-        torch.set_num_threads(max(1, options.threads // 2))
+        set_up("cpu", max(1, options.threads // 2))
         self._learner = Learner(agent, 3e-4, 3e-4, options.threads)
         self._mix = GoalMix(waypoint=0.0, future=0.8, displaced=0.0, pursued=0.2, horizon=300)
-        self._options, self._rng = options, rng
-        self.sampling_s = 0.0
+        self._batch_size, self._rng = options.batch_size, rng
 
-    def update(self, count: int) -> None:
-        """Take so many updates."""
-        torch.set_num_threads(max(1, self._options.threads // 2))
-        torch.backends.mkldnn.matmul.fp32_precision = ONEDNN
-        with mock.patch.object(networks, "hidden_dtype", self._hidden):
-            for _ in range(count):
-                start = time.perf_counter()
-                batch = self._data.transitions(self._options.batch_size, self._mix, self._rng)
-                self.sampling_s += time.perf_counter() - start
-                self._learner.update(batch, 0.0, None)
+    def update(self, count: int) -> float:
+        """Take so many updates, and return the seconds that sampling took."""
+        sampling = 0.0
+        for _ in range(count):
+            start = time.perf_counter()
+            batch = self._data.transitions(self._batch_size, self._mix, self._rng)
+            sampling += time.perf_counter() - start
+            self._learner.update(batch, 0.0, None)
+        return sampling
 
 
 class StackShapes(gymnasium.Env):
@@ -142,7 +147,9 @@ class Peer:
             from sbx import SAC
         else:
             from stable_baselines3 import SAC
-        self._options, self._products = options, products
+        torch.set_num_threads(options.threads)
+        torch.backends.mkldnn.matmul.fp32_precision = products
+        self._batch_size = options.batch_size
         self._model = SAC(
             "MultiInputPolicy",
             StackShapes(),
@@ -171,11 +178,10 @@ class Peer:
                 -np.ones(1), done, [{"TimeLimit.truncated": True}],
             )  # fmt: skip
 
-    def update(self, count: int) -> None:
-        """Take so many updates."""
-        torch.set_num_threads(self._options.threads)
-        torch.backends.mkldnn.matmul.fp32_precision = self._products
-        self._model.train(count, self._options.batch_size)
+    def update(self, count: int) -> float:
+        """Take so many updates; what sampling takes of them is not known."""
+        self._model.train(count, self._batch_size)
+        return 0.0
 
 
 def limit(options: Options, layers: tuple[int, ...]) -> tuple[float, float]:
@@ -205,41 +211,76 @@ def timed(work: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
+LEARNERS: dict[str, Callable[[Options, tuple[int, ...]], Ours | Peer]] = {
+    "ours": Ours,
+    "ours, fp32": lambda options, layers: Ours(options, layers, lambda inputs: inputs.dtype),
+    "stable-baselines3": lambda options, layers: Peer(options, layers, "stable-baselines3"),
+    "the same, oneDNN": lambda options, layers: Peer(options, layers, "stable-baselines3", ONEDNN),
+    "sbx": lambda options, layers: Peer(options, layers, "sbx"),
+}
+
+
+@dataclasses.dataclass
+class Spent:
+    """Seconds of one learner."""
+
+    wall: float = 0.0
+    processor: float = 0.0
+    sampling: float = 0.0
+
+
+def serve(name: str, options: Options, layers: tuple[int, ...], pipe: Connection) -> None:
+    """Take as many updates as the pipe asks for, and say what they took, until it asks for none."""
+    learner = LEARNERS[name](options, layers)
+    while count := pipe.recv():
+        start, used = time.perf_counter(), time.process_time()
+        sampling = learner.update(count)
+        wall, processor = time.perf_counter() - start, time.process_time() - used
+        pipe.send(Spent(wall, processor, sampling))
+
+
 def compare(options: Options, layers: tuple[int, ...]) -> None:
     """Print the rates of one network size."""
-    ours = Ours(options, layers, networks.hidden_dtype)
-    learners: dict[str, Ours | Peer] = {
-        "ours": ours,
-        "ours, fp32": Ours(options, layers, lambda inputs: inputs.dtype),
-    }
-    learners["stable-baselines3"] = Peer(options, layers, "stable-baselines3")
-    learners["the same, oneDNN"] = Peer(options, layers, "stable-baselines3", ONEDNN)
-    if find_spec("sbx"):
-        learners["sbx"] = Peer(options, layers, "sbx")
-    for learner in learners.values():
-        learner.update(options.turn_updates)
-    ours.sampling_s = 0.0
-    spent, processor = dict.fromkeys(learners, 0.0), dict.fromkeys(learners, 0.0)
+    context = multiprocessing.get_context("spawn")
+    pipes, processes = {}, []
+    for name in LEARNERS:
+        if name == "sbx" and not find_spec("sbx"):
+            continue
+        pipes[name], theirs = context.Pipe()
+        arguments = (name, options, layers, theirs)
+        processes.append(context.Process(target=serve, args=arguments, daemon=True))
+        with mock.patch.dict(os.environ):
+            if not name.startswith("ours"):
+                os.environ.pop("OMP_WAIT_POLICY")  # ours, from pretrain/__init__.py
+            processes[-1].start()
+        pipes[name].send(options.turn_updates)
+        pipes[name].recv()
+    spent = {name: Spent() for name in pipes}
     for _ in range(options.turns):
-        for name, learner in learners.items():
-            start, used = time.perf_counter(), time.process_time()
-            learner.update(options.turn_updates)
-            spent[name] += time.perf_counter() - start
-            processor[name] += time.process_time() - used
+        for name, pipe in pipes.items():
+            pipe.send(options.turn_updates)
+            turn, total = pipe.recv(), spent[name]
+            total.wall += turn.wall
+            total.processor += turn.processor
+            total.sampling += turn.sampling
+    for pipe, process in zip(pipes.values(), processes, strict=True):
+        pipe.send(0)
+        process.join()
     updates = options.turns * options.turn_updates
     bound, error = limit(options, layers)
     print(f"{layers[0]} x {len(layers)}, batch {options.batch_size}, {options.threads} threads")
-    for name, seconds in spent.items():
-        rate = updates / seconds
-        bf16, fp32 = seconds / spent["ours"], seconds / spent["ours, fp32"]
+    ours, fp32 = spent["ours"], spent["ours, fp32"]
+    for name, total in spent.items():
+        rate, processor = updates / total.wall, 1e3 * total.processor / updates
+        faster, faster_fp32 = total.wall / ours.wall, total.wall / fp32.wall
         print(
-            f"  {name:18s} {rate:6.1f} updates/s; ours {bf16:4.2f} times as fast, fp32 {fp32:4.2f};"
-            f" {1e3 * processor[name] / updates:5.1f} ms of processor time"
+            f"  {name:18s} {rate:6.1f} updates/s; ours {faster:4.2f} times as fast,"
+            f" fp32 {faster_fp32:4.2f}; {processor:5.1f} ms of processor time"
         )
     print(
         f"  {'arithmetic limit':18s} {bound:6.1f} updates/s, fp32; error of a product {error:.0e}"
     )
-    print(f"  sampling: {ours.sampling_s / spent['ours']:.1%} of our update")
+    print(f"  sampling: {ours.sampling / ours.wall:.1%} of our update")
 
 
 def main() -> None:
