@@ -68,6 +68,20 @@ def at_least(least: int, options: Mapping[str, int | None]) -> None:
             raise ConfigError(f"{flag} must be at least {least}; got {value}")
 
 
+def above_zero(options: Mapping[str, float]) -> None:
+    """Raise ConfigError, naming the option, unless each is a finite number above 0."""
+    for flag, value in options.items():
+        if not 0 < value < float("inf"):
+            raise ConfigError(f"{flag} must be above 0; got {value}")
+
+
+def zero_to_one(options: Mapping[str, float]) -> None:
+    """Raise ConfigError, naming the option, unless each is 0 to 1."""
+    for flag, value in options.items():
+        if not 0 <= value <= 1:
+            raise ConfigError(f"{flag} must be 0 to 1; got {value}")
+
+
 def _build(kind: Any, plain: Any, where: str, absent: Any) -> Any:
     """Return ``plain`` as a value of the type ``kind``; ``where`` ends in a dot if anything."""
     if kind is Any or (absent is not None and plain is absent):

@@ -30,8 +30,6 @@ class OnlineConfig:
     lr: float = 5e-5
     """Of SAC at the start: less than pretraining ends with, or what it settled is stirred up
     again. It falls linearly to a tenth."""
-    cloning: float = 20.0
-    """Weight of cloning the actions that led to the goal."""
     generator_every: int = 4
     """Updates of SAC for one of the generator, which learns from old and new data by their
     amounts; 0 leaves it as it is."""

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field, replace
+from itertools import count
 from pathlib import Path
 
 import numpy as np
 
-from eisp_data.config import at_least, save_yaml
+from eisp_data.config import at_least, load_yaml, save_yaml
 from eisp_data.errors import ConfigError, EispError, RobotError
 from eisp_data.robots.record_controllers import Controller, Decision, Limited, Script, Slowed
 from eisp_data.robots.session import Ended
 from eisp_data.robots.session_cell import Cell
 from eisp_data.robots.session_run import Plan, Report, run_session
 from eisp_data.robots.session_view import Seen
+from eisp_data.storage.files import replace_atomically
 from eisp_data.tasks.base import SUCCESS_DISTANCE_M, Task
 from eisp_data.tasks.registry import get_task
 from finetune.deploy_config import DeployConfig
@@ -22,11 +24,12 @@ from finetune.deploy_policy import Looking, PolicyController
 from finetune.deploy_trace import distance_curve, read_traces
 from finetune.disturb import Hand
 from finetune.evaluate import share_interval
-from finetune.run import load_for_rollouts
+from finetune.run import check_layout, load_for_rollouts
 from pretrain.agent import Agent
 from pretrain.checks import check_subgoals
 from pretrain.config import SubgoalConfig
 from pretrain.device import set_up
+from pretrain.layout import Layout
 from pretrain.saved import saved_subgoals
 
 RESULTS, SETTINGS, CURVE = "results.jsonl", "deploy.yaml", "distance.svg"
@@ -115,8 +118,7 @@ def deploy(config: DeployConfig) -> None:
     """Run a policy on a robot, and print what became of it, also if it ended in an error."""
     task, agent = _prepare(config)
     first = _done_before(config)
-    name = f"session_{first:04d}.mcap"
-    report = Report(config.output_dir / name)
+    report = Report(_free_name(config.output_dir, first))
     run = _Run(config, task, agent, report, first)
     config.output_dir.mkdir(parents=True, exist_ok=True)
     save_yaml(replace(config, resume=False), config.output_dir / SETTINGS)
@@ -148,6 +150,7 @@ def load_policy(path: Path | None, task: Task, subgoals: SubgoalConfig, device: 
     agent = load_for_rollouts(path, subgoals, device)
     if agent.config.task != task.name:
         raise ConfigError(f"{path} is a policy of {agent.config.task!r}, not of {task.name!r}")
+    check_layout(agent, Layout.of(task))
     return agent
 
 
@@ -177,13 +180,52 @@ def _prepare(config: DeployConfig) -> tuple[Task, Agent | None]:
 
 def _done_before(config: DeployConfig) -> int:
     """Return how many episodes the output folder has."""
-    results = config.output_dir / RESULTS
-    if config.output_dir.exists() and any(config.output_dir.iterdir()) and not config.resume:
+    folder = config.output_dir
+    if not folder.exists() or not any(folder.iterdir()):
+        return 0
+    if not config.resume:
         raise ConfigError(
-            f"{config.output_dir} is not empty; add --resume to go on with it, or choose another "
-            "--output-dir"
+            f"{folder} is not empty; add --resume to go on with it, or choose another --output-dir"
         )
-    return len(results.read_text().splitlines()) if results.exists() else 0
+    if (folder / SETTINGS).exists():
+        _check_same(config, load_yaml(DeployConfig, folder / SETTINGS))
+    results = folder / RESULTS
+    if not results.exists():
+        return 0
+    lines = results.read_text().splitlines(keepends=True)
+    whole = [line for line in lines if line.endswith("\n")]  # a kill may have cut off the last
+    if whole != lines:
+        replace_atomically(results, lambda draft: draft.write_text("".join(whole)))
+    return len(whole)
+
+
+def _check_same(config: DeployConfig, begun: DeployConfig) -> None:
+    """Raise ConfigError if episodes of the two would not be of one kind."""
+    ours, theirs = (
+        {
+            "--robot": each.robot,
+            "--task": each.task,
+            "--control": each.control,
+            "--policy.path": each.policy.path,
+            "--subgoals": each.subgoals,
+            "--seed": each.seed,
+            "--interference": each.interference,
+        }
+        for each in (config, begun)
+    )
+    different = [flag for flag, value in ours.items() if value != theirs[flag]]
+    if different:
+        raise ConfigError(
+            f"--resume: {config.output_dir} was begun with another {', '.join(different)}; give "
+            "the same, or choose another --output-dir"
+        )
+
+
+def _free_name(folder: Path, first: int) -> Path:
+    """Return where to record the episodes from this one on: an episode that a fault cut off has
+    left a recording and may have left no result."""
+    names = (folder / f"session_{number:04d}.mcap" for number in count(first))
+    return next(path for path in names if not path.exists())
 
 
 def _plan(run: _Run) -> Plan:

@@ -30,10 +30,10 @@ class OracleSubgoals(SubgoalPolicy):
 
     def __init__(self, agent: Agent, worlds: AnyWorlds, device: str) -> None:
         super().__init__(agent, worlds.count, device)
-        if not isinstance(worlds, Worlds):
+        if not isinstance(worlds, Worlds) or agent.vision:
             raise ConfigError(
-                f"--subgoals.source oracle: {worlds.name} has no scripted policy; choose "
-                "generator, random or none"
+                f"--subgoals.source oracle: {worlds.name} has no scripted policy, or none that "
+                "sees images; choose generator, random or none"
             )
         self._worlds = worlds
         self._physics = worlds.task.physics()

@@ -78,7 +78,7 @@ def read_run(folder: Path) -> Run:
     video = folder / "episode.mp4"
     run = Run(
         folder=folder,
-        metrics=_read_metrics(folder / "metrics.jsonl"),
+        metrics=read_metrics(folder / "metrics.jsonl"),
         before=_read_evaluation(folder / "evaluation_before.json"),
         after=_read_evaluation(folder / "evaluation_after.json"),
         configs={path.name: path.read_text() for path in sorted(folder.glob("*.yaml"))},
@@ -113,7 +113,8 @@ def render(run: Run) -> str:
     )
 
 
-def _read_metrics(path: Path) -> list[dict[str, Any]]:
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """Return the lines of a run's metrics; none if the file is missing."""
     lines = path.read_text().splitlines() if path.exists() else []
     entries = []
     for line in lines:
@@ -194,18 +195,16 @@ def _learning(run: Run) -> str:
     online = run.stage("finetune", "eval/success_last")
     if not online:
         return page.section("Learning", "No evaluation was made while this run was learning.")
-    offline = run.stage("pretrain", "eval/success_last")
     end = max((m["wall_s"] for m in run.metrics if m.get("stage") == "pretrain"), default=0.0)
     # Each stage counts its own seconds.
-    minutes = [m["wall_s"] / 60 for m in offline] + [(end + m["wall_s"]) / 60 for m in online]
-    steps = [0.0] * len(offline) + [m["env_steps"] for m in online]
-    points = offline + online
+    minutes = [(end + m["wall_s"]) / 60 for m in online]
+    steps = [m["env_steps"] for m in online]
     charts = []
     for x, label, regions in (
         (steps, "environment steps online", []),
         (minutes, "minutes", _regions(end / 60, minutes[-1])),
     ):
-        charts += _curves(run, points, x, label, regions)
+        charts += _curves(run, online, x, label, regions)
     text = (
         "Evaluations on seeds of their own while learning, without exploration. "
         + _dip_in_words(online)

@@ -11,9 +11,9 @@ import torch
 
 from eisp_data.cli.collect import episode_seeds
 from eisp_data.collect import explore
-from eisp_data.config import at_least, load_yaml
+from eisp_data.config import above_zero, at_least, load_yaml, zero_to_one
 from eisp_data.errors import ConfigError
-from eisp_data.runs.folder import begin_run, has_progress
+from eisp_data.runs.folder import begin_run, folders_of_run, has_progress
 from eisp_data.sim.gym_worlds import AnyWorlds, GymWorlds
 from eisp_data.sim.worlds import Worlds
 from eisp_data.storage.files import write_json
@@ -68,10 +68,12 @@ def finetune(config: FinetuneConfig) -> dict[str, float]:
         device,
         config.threads,
     )
+    if resumed:
+        finetuner.restore()
     begin_run(run, config, "finetune.yaml")
     if config.policy.path and not resumed:
         _keep_history(config.policy.path, run)
-    summary = finetuner(resumed)
+    summary = finetuner()
     write_json(run / "summary.json", summary)
     return summary
 
@@ -94,13 +96,14 @@ def _check(config: FinetuneConfig) -> None:
         },
     )
     at_least(online.round_steps + 1, {"--online.replay-size": online.replay_size})
-    for name, share in (
-        ("offline-share", online.offline_share),
-        ("pursued", online.pursued),
-        ("noise", online.noise),
-    ):
-        if not 0 <= share <= 1:
-            raise ConfigError(f"--online.{name} must be 0 to 1; got {share}")
+    above_zero({"--online.lr": online.lr, "--online.generator-lr": online.generator_lr})
+    zero_to_one(
+        {
+            "--online.offline-share": online.offline_share,
+            "--online.pursued": online.pursued,
+            "--online.noise": online.noise,
+        }
+    )
     check_subgoals(config.subgoals, "--subgoals")
 
 
@@ -109,7 +112,26 @@ def make_worlds(agent: Agent, count: int) -> AnyWorlds:
     name = agent.config.task
     if agent.vision and agent.config.vision:
         return ImageWorlds(name, agent.vision, agent.config.vision, count)
-    return Worlds(TASKS[name], count) if name in TASKS else GymWorlds(name, count)
+    if name in TASKS:
+        check_layout(agent, Layout.of(TASKS[name]))
+        return Worlds(TASKS[name], count)
+    worlds = GymWorlds(name, count)
+    check_layout(agent, Layout(worlds.observation_dim, worlds.goal_dim, worlds.action_dim))
+    return worlds
+
+
+def check_layout(agent: Agent, wanted: Layout) -> None:
+    """Raise ConfigError unless an agent's arrays have the sizes of an environment's: a recording
+    that it learned from may have had others under the same name."""
+    sizes, others = (
+        (layout.observation_dim, layout.goal_dim, layout.action_dim)
+        for layout in (agent.layout, wanted)
+    )
+    if sizes != others:
+        raise ConfigError(
+            f"the policy takes observations, goals and actions of {sizes} numbers; those of "
+            f"{agent.config.task!r} have {others}"
+        )
 
 
 def load_for_rollouts(path: Path | None, subgoals: SubgoalConfig, device: str) -> Agent:
@@ -131,7 +153,7 @@ def _dataset(config: FinetuneConfig, agent: Agent) -> Trajectories:
 
 def _pretraining_dataset(path: Path | None) -> Path:
     assert path is not None
-    for folder in (path, *path.resolve().parents):
+    for folder in folders_of_run(path):
         if (folder / "pretrain.yaml").exists():
             return load_yaml(PretrainConfig, folder / "pretrain.yaml").dataset.root
     raise ConfigError(f"{path} does not say what it was pretrained on; give --dataset.root")
@@ -139,7 +161,7 @@ def _pretraining_dataset(path: Path | None) -> Path:
 
 def _keep_history(policy: Path, run: Path) -> None:
     """Start the run's metrics with those of the pretraining, so that one curve shows both."""
-    for folder in (policy, *policy.resolve().parents):
+    for folder in folders_of_run(policy):
         history = folder / "metrics.jsonl"
         if history.exists():
             shutil.copy(history, run / "metrics.jsonl")

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from eisp_data.errors import ConfigError
+from eisp_data.errors import ConfigError, DataError
 from eisp_data.runs.metrics import MetricsLog, Speeds
 from eisp_data.sim.gym_worlds import AnyWorlds
 from finetune.config import OnlineConfig
@@ -102,7 +102,12 @@ class Rollouts:
         }
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Go on from what ``state`` returned."""
+        """Go on from what ``state`` returned; DataError if it is of another number of worlds."""
+        if len(arrays["solved"]) != self.worlds.count:
+            raise DataError(
+                f"--online.worlds {self.worlds.count}: the run to resume has "
+                f"{len(arrays['solved'])}"
+            )
         prefix = "worlds/"
         self.worlds.restore_snapshot(
             {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
@@ -167,14 +172,13 @@ class Finetuner:
         self._round = 0
         self._spent = 0.0
 
-    def __call__(self, resume: bool) -> dict[str, float]:
+    def __call__(self) -> dict[str, float]:
         """Train, or go on training, to the last round; return the summary of the run."""
-        if resume:
-            self._restore()
-        done = self._round * self.config.updates if resume else -1
+        begun = bool(self._curve)
+        done = self._round * self.config.updates if begun else -1
         log = MetricsLog(self.run, "finetune", done)
         start = time.monotonic() - self._spent
-        if not resume:
+        if not begun:
             self._rollouts.start(np.arange(self.config.worlds))
             self._evaluate(log, {}, start)
         rounds = range(self._round + 1, self.config.rounds + 1)
@@ -205,7 +209,9 @@ class Finetuner:
             hindsight = None
             if config.generator_every and update % config.generator_every == 0:
                 hindsight = self._hindsight()
-            info |= self._learner.update(Batch.joined(parts), config.cloning, hindsight)
+            info |= self._learner.update(
+                Batch.joined(parts), self.agent.config.sac.cloning, hindsight
+            )
         return info
 
     def _hindsight(self) -> tuple[Tensor, Tensor, Tensor] | None:
@@ -265,7 +271,8 @@ class Finetuner:
             self.run, self._round, self.agent, self._learner.optimizers, self._rng, numbers, arrays
         )
 
-    def _restore(self) -> None:
+    def restore(self) -> None:
+        """Go back to where the newest checkpoint was; DataError if it is of other settings."""
         self._round, numbers, arrays = checkpoint.restore(
             self.run, self.agent, self._learner.optimizers, self._rng
         )
@@ -276,8 +283,11 @@ class Finetuner:
 
 
 def _with_pursued(mix: GoalMix, share: float) -> GoalMix:
-    """Return the mix with this share of pursued goals, and as much less of all the others."""
-    rest = 1.0 - share
+    """Return the mix with this share of pursued goals, and accordingly less of all the others."""
+    others = 1.0 - mix.pursued
+    if not others:
+        return mix
+    rest = (1.0 - share) / others
     return replace(
         mix,
         waypoint=rest * mix.waypoint,

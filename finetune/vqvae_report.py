@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import io
-import json
 from html import escape
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from eisp_data.storage.cache import load_arrays, load_images
 from eisp_data.storage.files import replace_atomically
 from finetune.charts import Series, line_chart
 from finetune.page import page
+from finetune.report import read_metrics
 from finetune.rollout import SubgoalPolicy
 from finetune.run import load_for_rollouts
 from pretrain.saved import saved_subgoals
@@ -51,12 +51,12 @@ def write_vqvae_report(
         output: the page; ``report.html`` in the run if left out.
     """
     model, vision = load(path)
-    found = evaluate(path)
+    curves = _curves(path)
     sections = [
         f"<h1>VQ-VAE of {escape(vision.task)}</h1>",
-        f'<div class="box"><pre>{escape(found.table())}</pre></div>',
+        f'<div class="box"><pre>{escape(evaluate(path).table())}</pre></div>',
         "<h2>Training</h2>",
-        f'<div class="pair">{"".join(_curves(path))}</div>',
+        f'<div class="pair">{"".join(curves)}</div>',
         "<h2>Originals, and what comes back from their codes</h2>",
         "<p>Frames of episodes that it was not trained on; below each its reconstruction.</p>",
         _figure(reconstructions(path, model, vision.camera)),
@@ -131,10 +131,9 @@ def strip(above: np.ndarray, below: np.ndarray) -> np.ndarray:
 
 def _curves(path: Path) -> list[str]:
     """Return charts of the loss and of the PSNR."""
-    file = path / "metrics.jsonl"
-    if not file.exists():
+    entries = read_metrics(path / "metrics.jsonl")
+    if not entries:
         raise DataError(f"{path} holds no run of eisp-vqvae train: metrics.jsonl is missing")
-    entries = [json.loads(line) for line in file.read_text().splitlines()]
     updates = [entry["updates"] for entry in entries]
 
     def series(name: str, key: str, colour: str) -> Series:

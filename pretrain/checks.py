@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from eisp_data.config import at_least
+from eisp_data.config import above_zero, at_least, zero_to_one
 from eisp_data.errors import ConfigError
 from pretrain.config import GoalMix, PretrainConfig, SubgoalConfig
 
@@ -23,7 +23,25 @@ def check_pretrain(config: PretrainConfig) -> None:
             "--threads": config.threads,
             "--agent.waypoints": config.agent.waypoints,
             "--agent.mix.horizon": config.agent.mix.horizon,
+            "--agent.movers.width": config.agent.movers.width,
+            "--agent.movers.modes": config.agent.movers.modes,
         },
+    )
+    for flag, layers in (
+        ("--agent.sac.layers", config.agent.sac.layers),
+        ("--agent.hybrid.layers", config.agent.hybrid.layers),
+    ):
+        if not layers or min(layers) < 1:
+            raise ConfigError(f"{flag} must be one or more sizes of at least 1; got {layers}")
+    above_zero({"--agent.sac.lr": config.agent.sac.lr, "--generator-lr": config.generator_lr})
+    zero_to_one(
+        {
+            "--agent.sac.tau": config.agent.sac.tau,
+            "--agent.mix.complete": config.agent.mix.complete,
+            "--agent.mix.furthest": config.agent.mix.furthest,
+            "--final-lr-share": config.final_lr_share,
+            "--generator-final-lr-share": config.generator_final_lr_share,
+        }
     )
     if not 0 < config.validation_share < 1:
         raise ConfigError(
@@ -45,9 +63,9 @@ def check_subgoals(config: SubgoalConfig, flag: str) -> None:
 
 
 def _check_mix(mix: GoalMix) -> None:
-    shares = mix.waypoint, mix.future, mix.displaced, mix.pursued
-    if min(shares) < 0 or abs(sum(shares) - 1) > _ROUNDING:
-        said = ", ".join(map(str, shares))
+    parts = mix.waypoint, mix.future, mix.displaced, mix.pursued
+    if min(parts) < 0 or not abs(sum(parts) - 1) <= _ROUNDING:
+        said = ", ".join(map(str, parts))
         raise ConfigError(
             "--agent.mix: the shares of waypoint, future, displaced and pursued goals must add up "
             f"to 1; got {said}"

@@ -23,7 +23,7 @@ class SacConfig:
     layers: tuple[int, ...] = (256, 256)
     """Hidden sizes of actor and critics (Table I: pi)."""
     lr: float = 3e-4
-    """At the start of pretraining; it falls linearly to a tenth."""
+    """At the start of pretraining."""
     alpha: float = 0.01
     """Temperature, fixed (Table I: alpha)."""
     gamma: float = 0.99
@@ -35,7 +35,7 @@ class SacConfig:
     clip_targets: bool = True
     """Clip the critics' targets to [-1 / (1 - gamma), 0], all that Eq. (1) allows."""
     cloning: float = 20.0
-    """Weight of cloning the actions that led to the goal, offline; 0 is plain SAC."""
+    """Weight of cloning the actions that led to the goal; 0 is plain SAC."""
 
 
 @dataclass(frozen=True)
@@ -105,10 +105,16 @@ class GoalMix:
     complete: float = 0.25
     """Share of the generator's samples that lead to the very goal of a demonstration: only few
     show the whole task, and what comes first in it."""
+    furthest: float = 0.5
+    """Share of the others that lead to the furthest waypoint that is no detour, for far goals are
+    what subgoals are for; the rest lead to any on the way there."""
     horizon: int = 40
     """How many steps later a ``future`` goal may lie."""
     tolerance_m: float = 0.05
     """epsilon of Eq. (1) for these goals: tighter than the task's, because errors add up."""
+    errors: float = 0.5
+    """Errors are added to these goals, in all this share of the tolerance: those of a trajectory
+    are met exactly, those of a rollout never, and what is done well enough must look done."""
 
 
 @dataclass(frozen=True)
@@ -162,7 +168,11 @@ class PretrainConfig:
     """Updates of SAC for one of the generator."""
     generator_batch_size: int = 256
     generator_lr: float = 2e-3
-    """Of the generator at the start; it falls linearly to a hundredth."""
+    """Of the generator at the start."""
+    final_lr_share: float = 0.1
+    """The learning rate of SAC falls linearly to this share of it; 1 keeps it constant."""
+    generator_final_lr_share: float = 0.01
+    """That of the generator."""
     validation_share: float = 0.1
     """Share of the episodes that are held out."""
     validate_every: int = 1_000

@@ -127,20 +127,20 @@ class Waypoints:
     """(W,) index one past the last waypoint that may be a final goal, when this is the next."""
 
     def subgoal_and_goal(
-        self, rows: np.ndarray, rng: np.random.Generator
+        self, rows: np.ndarray, furthest_share: float, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the dataset rows of the next waypoint and of a final goal at or after it.
 
         Args:
             rows: (B,) rows that have a waypoint after them.
-            rng: draws the final goals: half of them the furthest waypoint that is no detour, for
-                far goals are what subgoals are for, and the others uniformly among all that are
-                none.
+            furthest_share: of the final goals, the furthest waypoint that is no detour; the others
+                are drawn uniformly among all that are none.
+            rng: draws the final goals.
         """
         first = self.following[rows]
         furthest = self.beyond[first] - 1
         any_of_them = rng.integers(first, furthest + 1)
-        last = np.where(rng.random(len(rows)) < 0.5, furthest, any_of_them)
+        last = np.where(rng.random(len(rows)) < furthest_share, furthest, any_of_them)
         return self.row[first], self.row[last]
 
     def furthest(self, rows: np.ndarray) -> np.ndarray:

@@ -116,13 +116,17 @@ def _paper(task: str, root: Path, output_dir: Path) -> PretrainConfig:
                 future=1.0,
                 displaced=0.0,
                 complete=0.0,
+                furthest=1.0,
                 horizon=table.episode_steps,
+                errors=0.0,
             ),
         ),
         batch_size=table.batch_size,
         generator_every=1,
         generator_batch_size=table.batch_size,
         generator_lr=table.generator_lr,
+        final_lr_share=1.0,
+        generator_final_lr_share=1.0,
     )
 
 

@@ -164,13 +164,9 @@ class Trajectories:
         return result
 
     def _jitter(self, goal: np.ndarray, mix: GoalMix, rng: np.random.Generator) -> None:
-        """Add errors of about half the tolerance in all to (B, G) goals.
-
-        Goals taken from a trajectory are met exactly, those of a rollout never: what is done well
-        enough must look done, and not like a place to correct.
-        """
+        """Add the mix's errors to (B, G) goals."""
         places = goal[:, : self._layout.places_dim]
-        std = mix.tolerance_m / (2.0 * places.shape[1] ** 0.5)
+        std = mix.errors * mix.tolerance_m / places.shape[1] ** 0.5
         places += rng.standard_normal(places.shape, np.float32) * np.float32(std)
 
     def subgoals(
@@ -184,7 +180,7 @@ class Trajectories:
         whole = round(mix.complete * count) if len(self._complete) else 0
         rows = self.leading[rng.integers(len(self.leading), size=count)]
         rows[:whole] = self._complete[rng.integers(len(self._complete), size=whole)]
-        subgoal, goal = self.waypoints.subgoal_and_goal(rows, rng)
+        subgoal, goal = self.waypoints.subgoal_and_goal(rows, mix.furthest, rng)
         goal[:whole] = self.waypoints.furthest(rows[:whole])
         final = self.achieved_goal[goal]
         self._jitter(final, mix, rng)

@@ -47,22 +47,29 @@ def pretrain(config: PretrainConfig) -> Path:
     agent = Agent(config.agent, layout, train.moments(), torch.from_numpy(bank)).to(device)
     if agent.vision and vision:
         agent.vision.load_state_dict(vision.state_dict())
-    begin_run(run, config, "pretrain.yaml")
     learner = Learner(agent, config.agent.sac.lr, config.generator_lr, config.threads)
-    done, best, best_state, spent = 0, -np.inf, {}, 0.0
+    done, best, best_state, spent, finished = 0, -np.inf, {}, 0.0, False
     if resumed:
         done, numbers, arrays = checkpoint.restore(run, agent, learner.optimizers, rng)
         check_resumed(agent, vision, config.vqvae.path)
-        best, spent = numbers["best"], numbers["wall_s"]
+        best, spent, finished = numbers["best"], numbers["wall_s"], numbers["finished"]
         best_state = {name: torch.from_numpy(value) for name, value in arrays.items()}
+    begin_run(run, config, "pretrain.yaml")
     log = MetricsLog(run, "pretrain", done)
     start = time.monotonic() - spent
     info: dict[str, Tensor] = {}
+
+    def save() -> None:
+        numbers = {"best": best, "wall_s": spent, "finished": finished}
+        arrays = {name: value.cpu().numpy() for name, value in best_state.items()}
+        checkpoint.save(run, done, agent, learner.optimizers, rng, numbers, arrays)
+
     steps = range(done + 1, config.updates + 1)
     for update in tqdm(steps, "pretraining", config.updates, initial=done, mininterval=1.0):
         remaining = 1.0 - update / config.updates
         learner.set_lr(
-            config.agent.sac.lr * max(0.1, remaining), config.generator_lr * max(0.01, remaining)
+            config.agent.sac.lr * max(config.final_lr_share, remaining),
+            config.generator_lr * max(config.generator_final_lr_share, remaining),
         )
         batch = train.transitions(config.batch_size, config.agent.mix, rng)
         hindsight = None
@@ -75,22 +82,18 @@ def pretrain(config: PretrainConfig) -> Path:
                 best = float(held["log_likelihood"])
                 state = agent.proposer.state_dict()
                 best_state = {name: value.clone() for name, value in state.items()}
-            if update == config.updates:
-                agent.proposer.load_state_dict(best_state)
-            spent = time.monotonic() - start
+            done, spent = update, time.monotonic() - start
             values = {f"train/{k}": v for k, v in info.items()}
             values |= {f"held_out/{k}": v for k, v in held.items()}
             log.write(update, 0, spent, values)
-            checkpoint.save(
-                run,
-                update,
-                agent,
-                learner.optimizers,
-                rng,
-                {"best": best, "wall_s": spent},
-                {name: value.cpu().numpy() for name, value in best_state.items()},
-            )
+            finished = False
+            if update < config.updates:
+                save()
     log.close()
+    if not finished:
+        agent.proposer.load_state_dict(best_state)
+        finished = True
+        save()
     return run
 
 

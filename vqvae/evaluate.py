@@ -8,14 +8,15 @@ from pathlib import Path
 import numpy as np
 
 from eisp_data.config import load_yaml
-from eisp_data.errors import ConfigError
+from eisp_data.errors import ConfigError, DataError
 from eisp_data.runs.episodes import rows_of, split
+from eisp_data.runs.folder import folders_of_run
 from eisp_data.sim.pixels import Pixels
 from eisp_data.storage.cache import load_arrays, load_images
 from eisp_data.tasks.registry import get_task
 from vqvae import reading
 from vqvae.config import VisionConfig, VqVaeTrainConfig
-from vqvae.latents import encode, load_codes, see
+from vqvae.latents import check_task, encode, load_codes, see
 from vqvae.model import VqVae
 from vqvae.probe import Probe, probe
 from vqvae.quality import Quality, measure
@@ -74,10 +75,14 @@ def evaluate(path: Path, root: Path | None = None) -> VqVaeEvaluation:
     model, vision = load(path)
     trained = training_of(path)
     root = root or trained.dataset.root
-    arrays, codes = load_arrays(root), load_codes(root, model, vision.camera)
+    arrays = load_arrays(root)
+    check_task(root, arrays, vision)
+    held, rest = split(arrays.num_episodes, trained.validation_share, trained.seed)
+    if not len(rest):
+        raise DataError(f"{root} has too few episodes: {arrays.num_episodes}")
+    codes = load_codes(root, model, vision.camera)
     seen = see(model, codes)
     places, latents = seen[:, : model.places], seen[:, model.places :]
-    held, rest = split(arrays.num_episodes, trained.validation_share, trained.seed)
     rows, held_rows = rows_of(arrays, rest), rows_of(arrays, held)
     chosen = spread(held_rows, _MOST)
     names = [slot.kind for slot in get_task(arrays.spec.task).objects]
@@ -105,7 +110,7 @@ def _changed(
 
 def training_of(path: Path) -> VqVaeTrainConfig:
     """Return what a VQ-VAE was trained with."""
-    for folder in (path, *path.resolve().parents):
+    for folder in folders_of_run(path):
         if (folder / CONFIG_FILE).exists():
             return load_yaml(VqVaeTrainConfig, folder / CONFIG_FILE)
     raise ConfigError(f"{path} does not say what it was trained on: no {CONFIG_FILE} above it")

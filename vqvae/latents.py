@@ -41,6 +41,15 @@ def check_images(root: Path, camera: str, size: tuple[int, int]) -> None:
         )
 
 
+def check_task(root: Path, arrays: DatasetArrays, config: VisionConfig) -> None:
+    """Raise DataError unless the dataset is of the task that the VQ-VAE was trained on."""
+    if arrays.spec.task != config.task:
+        raise DataError(
+            f"{root} is a dataset of {arrays.spec.task!r}, the VQ-VAE was trained on "
+            f"{config.task!r}"
+        )
+
+
 def load_codes(root: Path, model: VqVae, camera: str) -> np.ndarray:
     """Return the codes (R, cells) uint16 of a dataset's images, mapped; rows as in its arrays.
 
@@ -107,10 +116,7 @@ def load_latent_arrays(root: Path, model: VqVae, config: VisionConfig) -> Datase
     """
     arrays = load_arrays(root)
     spec = arrays.spec
-    if spec.task != config.task:
-        raise DataError(
-            f"{root} is a dataset of {spec.task!r}, the VQ-VAE was trained on {config.task!r}"
-        )
+    check_task(root, arrays, config)
     seen = see(model, load_codes(root, model, config.camera))
     observation = observe(arrays.observation[:, : spec.proprio_dim], seen, model.places)
     name = image_task(spec.task)

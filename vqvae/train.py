@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from eisp_data.config import at_least
+from eisp_data.config import above_zero, at_least
 from eisp_data.errors import ConfigError, DataError
 from eisp_data.runs import MODEL, checkpoint
 from eisp_data.runs.device import choose_device
@@ -21,6 +22,7 @@ from eisp_data.runs.folder import begin_run, has_progress
 from eisp_data.runs.memory import keep_freed_memory
 from eisp_data.runs.metrics import MetricsLog
 from eisp_data.storage.cache import DatasetArrays, load_arrays, load_images
+from eisp_data.storage.files import one_line
 from vqvae import reading, saved
 from vqvae.config import VisionConfig, VqVaeTrainConfig
 from vqvae.latents import check_images, load_codes, see
@@ -32,6 +34,8 @@ from vqvae.reading import on_table
 CONFIG_FILE = "vqvae.yaml"
 _VALIDATION_IMAGES = 2048
 _MOMENT_IMAGES = 4096
+_MOST_CODES = 2**16
+"""Codes are stored as uint16."""
 
 
 def train(config: VqVaeTrainConfig) -> tuple[Path, Quality]:
@@ -56,18 +60,28 @@ def train(config: VqVaeTrainConfig) -> tuple[Path, Quality]:
     model.reader.set_moments(places[train_rows])
     model.to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=config.lr, fused=True)
-    begin_run(run, config, CONFIG_FILE)
     vision = VisionConfig(arrays.spec.task, config.dataset.camera, config.model, model.places)
-    done, spent = 0, 0.0
+    done, spent, finished = 0, 0.0, False
     if resumed:
-        folder = run / "checkpoints" / "last" / MODEL
-        model.load_state_dict(saved.load(folder)[0].state_dict())
+        folder = run / "checkpoints" / "last"
+        try:
+            model.load_state_dict(saved.load(folder / MODEL)[0].state_dict())
+        except RuntimeError as error:
+            raise DataError(f"{folder} cannot be resumed from: {one_line(error)}") from None
         done, numbers, _ = checkpoint.restore(run, {"adam": optimizer}, rng)
-        spent = numbers["wall_s"]
+        spent, finished = numbers["wall_s"], numbers["finished"]
+    begin_run(run, config, CONFIG_FILE)
     log = MetricsLog(run, "vqvae", done)
     start = time.monotonic() - spent
     held = images[spread(held_rows, _VALIDATION_IMAGES)]
-    quality, revived = measure(model, held) if done == config.updates else None, 0
+    revived = 0
+
+    def save() -> None:
+        numbers = {"wall_s": spent, "finished": finished}
+        optimizers = {"adam": optimizer}
+        write = partial(saved.save, model, vision)
+        checkpoint.save(run, done, write, optimizers, rng, numbers, {})
+
     steps = range(done + 1, config.updates + 1)
     bar = tqdm(steps, "vqvae", config.updates, initial=done, mininterval=1.0)
     for update in bar:
@@ -79,29 +93,22 @@ def train(config: VqVaeTrainConfig) -> tuple[Path, Quality]:
         revived += fresh
         if update % config.validate_every == 0 or update == config.updates:
             quality = measure(model, held)
-            if update == config.updates:
-                codes = load_codes(config.dataset.root, model, config.dataset.camera)
-                latents = see(model, codes[train_rows])[:, model.places :]
-                known = places[train_rows]
-                reading.learn(model.reader, latents, known, config.reader_updates, rng)
             bar.set_postfix(psnr=quality.psnr_db, used=quality.used)
-            spent = time.monotonic() - start
+            done, spent, finished = update, time.monotonic() - start, False
             values: dict[str, float | Tensor] = {f"train/{k}": v for k, v in info.items()}
             values |= {f"held_out/{k}": v for k, v in asdict(quality).items()}
             log.write(update, 0, spent, values | {"train/revived": revived})
-            checkpoint.save(
-                run,
-                update,
-                lambda folder: saved.save(model, vision, folder),
-                {"adam": optimizer},
-                rng,
-                {"wall_s": spent},
-                {},
-            )
+            if update < config.updates:
+                save()
             revived = 0
     log.close()
-    assert quality is not None
-    return run, quality
+    if not finished:
+        codes = load_codes(config.dataset.root, model, config.dataset.camera)
+        latents = see(model, codes[train_rows])[:, model.places :]
+        reading.learn(model.reader, latents, places[train_rows], config.reader_updates, rng)
+        finished, spent = True, time.monotonic() - start
+        save()
+    return run, measure(model, held)
 
 
 def step(
@@ -144,6 +151,9 @@ def check(config: VqVaeTrainConfig) -> None:
         },
     )
     at_least(0, {"--seed": config.seed})
+    above_zero({"--lr": config.lr})
+    if model.codes > _MOST_CODES:
+        raise ConfigError(f"--model.codes must be at most {_MOST_CODES}; got {model.codes}")
     if not model.reading >= 0:
         raise ConfigError(f"--model.reading must be at least 0; got {model.reading}")
     for flag, share in (

@@ -54,6 +54,8 @@ def save(
     shutil.rmtree(draft, ignore_errors=True)
     plain = {"step": step, "rng": rng.bit_generator.state, "numbers": dict(numbers)}
     tensors = {"torch_rng": torch.get_rng_state()} | _flatten(optimizers)
+    if torch.cuda.is_available():
+        tensors["cuda_rng"] = torch.cuda.get_rng_state()
     try:
         with writing(folder):
             save_model(draft / MODEL)
@@ -92,6 +94,8 @@ def restore(
         tensors = load_file(folder / _STATE / "state.safetensors")
         _unflatten(optimizers, tensors)
         torch.set_rng_state(torch.from_numpy(tensors["torch_rng"]))
+        if "cuda_rng" in tensors and torch.cuda.is_available():
+            torch.cuda.set_rng_state(torch.from_numpy(tensors["cuda_rng"]))
         rng.bit_generator.state = plain["rng"]
         step, numbers = plain["step"], plain["numbers"]
     except Exception as error:  # torch and each format have errors of their own

@@ -6,6 +6,10 @@ import numpy as np
 
 from eisp_data.storage.cache import DatasetArrays
 
+_GOLDEN_RATIO = (5.0**0.5 - 1.0) / 2.0
+"""Its multiples, modulo one, fill [0, 1) evenly however many are taken (Weyl)."""
+_ROUNDING = 1e-12
+
 
 def rows_of(arrays: DatasetArrays, episodes: np.ndarray) -> np.ndarray:
     """Return the rows of the named episodes."""
@@ -14,7 +18,11 @@ def rows_of(arrays: DatasetArrays, episodes: np.ndarray) -> np.ndarray:
 
 
 def split(episodes: int, share: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the numbers of the episodes that are held out, and of the others, each in order."""
-    order = np.random.default_rng(seed).permutation(episodes)
-    held = max(1, round(share * episodes))
-    return np.sort(order[:held]), np.sort(order[held:])
+    """Return the numbers of the episodes that are held out, at least one, and of the others.
+
+    Whether an episode is held out does not depend on how many others there are, so that a dataset
+    that has grown does not bring what was held out before into the training.
+    """
+    place = (np.random.default_rng(seed).random() + _GOLDEN_RATIO * np.arange(episodes)) % 1.0
+    held = place < max(share, place.min() + _ROUNDING)
+    return np.flatnonzero(held), np.flatnonzero(~held)

@@ -27,6 +27,12 @@ def has_progress(run: Path, resume: bool, name: str) -> bool:
     return resume and checkpoint.exists(run)
 
 
+def folders_of_run(path: Path) -> tuple[Path, ...]:
+    """Return the folder and those above it that may be its run: a checkpoint's model lies three
+    folders deep in one."""
+    return (path, *path.resolve().parents[:3])
+
+
 def begin_run(run: Path, config: object, name: str) -> None:
     """Make the folder of a run and write its configuration, once all input has proved usable."""
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
@@ -10,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from eisp_data.errors import DataError
 from eisp_data.storage.files import replace_atomically
 
 
@@ -65,8 +67,18 @@ class MetricsLog:
         return entry["stage"] != self._stage or entry["updates"] <= done
 
     def write(self, updates: int, env_steps: int, wall_s: float, values: Mapping[str, Any]) -> None:
-        """Log the values at this many updates and environment steps of the stage."""
+        """Log the values at this many updates and environment steps of the stage.
+
+        Raises:
+            DataError: a loss is not a number; the checkpoints before are of use.
+        """
         numbers = {name: float(value) for name, value in values.items()}
+        for name, value in numbers.items():
+            if name.startswith("train/") and not math.isfinite(value):
+                raise DataError(
+                    f"{self._stage}: {name} is {value} after {updates} updates: learning has "
+                    "diverged; take lower learning rates"
+                )
         head = {
             "stage": self._stage,
             "updates": updates,

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from image_samples import skip_without_opengl
 
+from eisp_data.config import save_yaml
 from eisp_data.errors import ConfigError
 from eisp_data.robots.calibration import CameraCalibration
 from eisp_data.robots.cell import transform_camera_to_task
@@ -25,7 +26,7 @@ from eisp_data.storage.mcap.writer import McapWriter
 from eisp_data.tasks.base import ACTION_SCALE_M
 from eisp_data.tasks.registry import TASKS
 from finetune.config import PolicyConfig
-from finetune.deploy import RESULTS, deploy
+from finetune.deploy import RESULTS, SETTINGS, deploy
 from finetune.deploy_config import DeployConfig
 from finetune.deploy_film import draw, film
 from finetune.deploy_policy import Looking
@@ -338,6 +339,36 @@ def test_a_policy_on_the_twin_is_recorded_judged_and_goes_on_where_it_stopped(
         assert log.indexed and not log.problems
         assert log.stats()["/action"].count == 15
         assert {"/subgoal", "/camera/top/image", "/joint_command"} <= set(log.topics)
+
+
+def begun(tmp_path: Path, policy: Path | None, results: str, **options: object) -> DeployConfig:
+    """Return settings to resume a deployment with that has left these results."""
+    config = config_for(tmp_path, policy, **options)
+    config.output_dir.mkdir()
+    save_yaml(config, config.output_dir / SETTINGS)
+    (config.output_dir / RESULTS).write_text(results)
+    return replace(config, resume=True)
+
+
+def test_other_episodes_are_not_added_to_those_there_are(tmp_path: Path, pretrained: Path) -> None:
+    config = begun(tmp_path, pretrained, "{}\n", seed=3)
+    with pytest.raises(ConfigError, match=r"was begun with another --control, --seed; give the"):
+        deploy(replace(config, control="script", seed=77))
+
+
+def test_an_episode_that_was_cut_off_is_done_again_and_its_recording_kept(
+    tmp_path: Path, pretrained: Path
+) -> None:
+    skip_without_opengl()
+    config = begun(tmp_path, pretrained, '{"seed": 0, "succ', episode_s=0.2, record_images=False)
+    recording = config.output_dir / "session_0000.mcap"
+    recording.write_bytes(b"cut off")
+    deploy(config)
+    [entry] = [json.loads(line) for line in (config.output_dir / RESULTS).read_text().splitlines()]
+    assert (entry["episode"], entry["outcome"]) == (0, "timeout")
+    assert recording.read_bytes() == b"cut off"
+    with McapLog(config.output_dir / "session_0001.mcap") as log:
+        assert log.indexed and not log.problems
 
 
 def test_an_unreachable_goal_is_refused_before_anything_moves(

@@ -64,6 +64,12 @@ def mistake(patch, capsys, command, *words: object) -> str:
     return said[-1]
 
 
+def test_a_script_sees_no_images(pretrained, monkeypatch, capsys):
+    words = ["--policy.path", pretrained, "--episodes", "1", "--subgoals.source", "oracle"]
+    said = mistake(monkeypatch, capsys, evaluate, *words)
+    assert "open_drawer_image has no scripted policy, or none that sees images" in said
+
+
 def test_images_lead_to_figures_and_a_report(work, pretrained, tmp_path, monkeypatch, capsys):
     tuned = tmp_path / "tuned"
     run(monkeypatch, finetune, "--policy.path", pretrained, "--output-dir", tuned, *ONLINE)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -9,22 +10,29 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from learning_samples import linear_agent
+from learning_samples import linear_agent, make_agent, small
 from safetensors.torch import load_file
 
+import finetune.train as finetune_train
 from eisp_data.cli.collect import CollectConfig, collect
 from eisp_data.errors import ConfigError, DataError
 from eisp_data.sim.gym_worlds import GymWorlds
 from finetune.config import DataConfig, EnvConfig, FinetuneConfig, OnlineConfig, PolicyConfig
+from finetune.evaluate import Evaluation
 from finetune.rollout import SubgoalPolicy
-from finetune.run import finetune
-from finetune.train import Rollouts, summarise
+from finetune.run import finetune, make_worlds
+from finetune.train import Finetuner, Rollouts, _with_pursued, summarise
 from pretrain import checkpoint
-from pretrain.config import SubgoalConfig
+from pretrain.config import AgentConfig, GoalMix, SubgoalConfig
+from pretrain.layout import Layout
+from pretrain.learner import Learner
+from pretrain.replay import Trajectories
+from pretrain.sac import Batch
 from pretrain.saved import saved_subgoals
 
 SMALL = OnlineConfig(
@@ -176,9 +184,98 @@ def test_a_generator_may_be_left_as_it_is(pretrained, tmp_path):
     assert all(torch.equal(before[name], after[name]) for name in names)
 
 
+def test_the_policy_of_the_best_evaluation_is_kept(pretrained, tmp_path, monkeypatch):
+    said, real = iter([0.2, 0.9, 0.4]), finetune_train.evaluate
+
+    def evaluate(*args: object, **options: object) -> Evaluation:
+        result = real(*args, **options)  # type: ignore[arg-type]
+        return replace(result, success_last=replace(result.success_last, mean=next(said)))
+
+    monkeypatch.setattr(finetune_train, "evaluate", evaluate)
+    summary = finetune(tiny_finetuning(pretrained, tmp_path))
+    assert (summary["offline_success"], summary["best_success"]) == (0.2, 0.9)
+    best, second, last = (
+        load_file(tmp_path / name / "pretrained_model/model.safetensors")
+        for name in ("best", "checkpoints/000001", "checkpoints/last")
+    )
+    assert all(torch.equal(best[name], second[name]) for name in best)
+    assert any(not torch.equal(best[name], last[name]) for name in best)
+
+
+def test_a_round_is_as_its_settings_say(pretrained, tmp_path, monkeypatch):
+    rates, noises, drawn = [], [], []
+    collect_round, transitions = Rollouts.collect, Trajectories.transitions
+
+    def collect(rollouts: Rollouts, steps: int, noise: float) -> tuple[np.ndarray, ...]:
+        noises.append(noise)
+        return collect_round(rollouts, steps, noise)
+
+    def draw(data: Trajectories, count: int, mix: GoalMix, rng: np.random.Generator) -> Batch:
+        drawn.append((data._purposeful, count, mix.pursued))
+        return transitions(data, count, mix, rng)
+
+    monkeypatch.setattr(Learner, "set_lr", lambda _, *both: rates.append(both))
+    monkeypatch.setattr(Rollouts, "collect", collect)
+    monkeypatch.setattr(Trajectories, "transitions", draw)
+    config = tiny_finetuning(
+        pretrained, tmp_path, updates=1, noise=0.25, offline_share=0.25, pursued=0.75, lr=1e-3
+    )
+    finetune(config)
+    assert noises == [0.25, 0.25]
+    assert drawn == [(False, 12, 0.75), (True, 4, 0.0)] * 2
+    np.testing.assert_allclose(rates, [(5e-4, 1.5e-4), (1e-4, 3e-5)])
+
+
+@pytest.mark.parametrize(("new", "old"), [(30, 10), (0, 5), (5, 0)])
+def test_the_generator_learns_from_old_and_new_data_by_their_amounts(new, old):
+    def data(rows: int, name: str) -> SimpleNamespace:
+        return SimpleNamespace(leading=range(rows), subgoals=lambda *_: name)
+
+    tuner = SimpleNamespace(
+        _online=data(new, "new"),
+        _offline=data(old, "old"),
+        _rng=np.random.default_rng(0),
+        _mix=None,
+        agent=SimpleNamespace(vision=None),
+        config=SMALL,
+    )
+    said = [Finetuner._hindsight(tuner) for _ in range(2000)]  # type: ignore[arg-type]
+    assert said.count("new") / 2000 == pytest.approx(new / (new + old), abs=0.03)
+
+
+@pytest.mark.parametrize("pursued", [0.0, 0.1, 1.0])
+def test_pursued_goals_take_as_much_from_all_others_and_shares_add_up(pursued):
+    rest = 1.0 - pursued
+    mix = GoalMix(0.5 * rest, 0.25 * rest, 0.25 * rest, pursued)
+    online = _with_pursued(mix, 0.4)
+    shares = np.array([online.waypoint, online.future, online.displaced, online.pursued])
+    expected = [0, 0, 0, 1] if pursued == 1 else [0.3, 0.15, 0.15, 0.4]
+    np.testing.assert_allclose(shares, expected, atol=1e-12)
+
+
+def test_what_cannot_be_resumed_is_told_and_changes_nothing(finished, tmp_path, pretrained):
+    shutil.copytree(finished, tmp_path / "run", symlinks=True)
+    config = replace(tiny_finetuning(pretrained, tmp_path / "run"), resume=True)
+    before = (tmp_path / "run/finetune.yaml").read_text()
+    with pytest.raises(DataError, match=r"--online\.worlds 3: the run to resume has 2"):
+        finetune(replace(config, online=replace(SMALL, worlds=3)))
+    assert (tmp_path / "run/finetune.yaml").read_text() == before
+    finetune(config)
+    assert_same_run(tmp_path / "run", finished)
+
+
+def test_a_policy_of_a_recording_with_arrays_of_its_own_is_told_from_the_tasks():
+    agent = make_agent(
+        small(AgentConfig("stack", features="plain", generator="hybrid")), Layout(23, 9, 4)
+    )
+    with pytest.raises(ConfigError, match=r"of \(23, 9, 4\) numbers; .* have \(55, 9, 4\)"):
+        make_worlds(agent, 1)
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
+        ({"online": replace(SMALL, lr=float("nan"))}, "--online.lr must be above 0; got nan"),
         ({"policy": PolicyConfig()}, "give --policy.path, a pretrained policy, or --env.id"),
         ({"policy": PolicyConfig(Path("nowhere"))}, "nowhere holds no policy"),
         ({"env": EnvConfig("FetchReach-v4")}, "is a policy of 'stack', not 'FetchReach-v4'"),

@@ -136,7 +136,7 @@ def test_a_goal_is_in_the_same_episode_at_or_after_the_subgoal_and_no_detour(fou
     goals, starts = joined_paths(found)
     waypoints = find_waypoints(goals, starts, parts)
     rows = np.repeat(np.flatnonzero(waypoints.following >= 0), 3)
-    subgoal, goal = waypoints.subgoal_and_goal(rows, np.random.default_rng(seed))
+    subgoal, goal = waypoints.subgoal_and_goal(rows, 0.5, np.random.default_rng(seed))
     assert (rows < subgoal).all() and (subgoal <= goal).all()
     episode = np.searchsorted(starts, [rows, subgoal, goal], side="right")
     assert (episode == episode[0]).all()
@@ -153,8 +153,9 @@ def test_every_goal_that_is_no_detour_is_drawn(found, parts):
     if len(leading):
         first = waypoints.following[leading[0]]
         allowed = set(waypoints.row[first : waypoints.beyond[first]].tolist())
-        _, goal = waypoints.subgoal_and_goal(np.repeat(leading, 500), np.random.default_rng(0))
-        assert set(goal.tolist()) == allowed
+        rows, rng = np.repeat(leading, 500), np.random.default_rng(0)
+        assert set(waypoints.subgoal_and_goal(rows, 0.5, rng)[1].tolist()) == allowed
+        assert set(waypoints.subgoal_and_goal(rows, 1.0, rng)[1].tolist()) == {max(allowed)}
 
 
 @pytest.mark.parametrize("parts", [None, 3])

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from learning_samples import tiny_pretraining
 
@@ -11,8 +12,10 @@ from eisp_data.errors import ConfigError
 from eisp_data.tasks.base import SUCCESS_DISTANCE_M
 from eisp_data.tasks.registry import TASKS
 from pretrain.checks import check_pretrain
-from pretrain.config import GoalMix, PretrainConfig
+from pretrain.config import GoalMix, HybridConfig, MoversConfig, PretrainConfig, SacConfig
+from pretrain.layout import Layout
 from pretrain.presets import preset
+from pretrain.replay import Trajectories
 
 HERE = Path("data"), Path("runs")
 
@@ -43,6 +46,20 @@ def test_the_papers_preset_is_its_table_1(task):
     # Plain SAC: what is ours is off.
     assert not agent.sac.layer_norm and not agent.sac.clip_targets and agent.sac.cloning == 0
     assert agent.mix.tolerance_m == SUCCESS_DISTANCE_M and agent.mix.displaced == 0
+    assert agent.mix.errors == 0 and config.final_lr_share == config.generator_final_lr_share == 1
+
+
+def test_the_papers_generator_learns_to_get_to_the_end_of_the_trajectory():
+    mix = preset("paper", "stack", *HERE).agent.mix
+    data = Trajectories(Layout(9, 9, 4), 10**9, 4, purposeful=True)
+    rng = np.random.default_rng(0)
+    path = rng.normal(size=(13, 9)).astype(np.float32)
+    data.extend(path, path, np.zeros((13, 4), np.float32), path, np.array([0, 13]))
+    observation, goal, subgoal = (part.numpy() for part in data.subgoals(64, mix, rng))
+    assert (goal == path[12]).all()
+    for seen, following in zip(observation, subgoal, strict=True):
+        [row] = np.flatnonzero((path == seen).all(1))
+        np.testing.assert_array_equal(following, path[3 * (row // 3 + 1)])
 
 
 def test_another_environment_gets_what_needs_no_objects_and_no_rest():
@@ -70,6 +87,14 @@ def test_another_environment_gets_what_needs_no_objects_and_no_rest():
         ({"mix": GoalMix(1.5, -0.5, 0.0)}, "--agent.mix: .* add up to 1; got 1.5, -0.5, 0.0"),
         ({"waypoints": 0}, "--agent.waypoints must be at least 1; got 0"),
         ({"candidates": 0}, "--agent.subgoals.candidates must be at least 1; got 0"),
+        ({"sac": SacConfig(layers=())}, "--agent.sac.layers must be one or more sizes"),
+        ({"sac": SacConfig(lr=-1.0)}, "--agent.sac.lr must be above 0; got -1.0"),
+        ({"sac": SacConfig(tau=5.0)}, "--agent.sac.tau must be 0 to 1; got 5.0"),
+        ({"movers": MoversConfig(modes=0)}, "--agent.movers.modes must be at least 1; got 0"),
+        ({"hybrid": HybridConfig(layers=(0,))}, "--agent.hybrid.layers must be one or more"),
+        ({"mix": GoalMix(complete=2.0)}, "--agent.mix.complete must be 0 to 1; got 2.0"),
+        ({"mix": GoalMix(float("nan"))}, "--agent.mix: .* add up to 1; got nan"),
+        ({"generator_lr": float("nan")}, "--generator-lr must be above 0; got nan"),
     ],
 )
 def test_settings_that_cannot_be_used_are_named(changes, said):
@@ -81,7 +106,7 @@ def test_settings_that_cannot_be_used_are_named(changes, said):
     elif name == "candidates":
         subgoals = replace(agent.subgoals, candidates=value)
         config = replace(config, agent=replace(agent, subgoals=subgoals))
-    elif name in ("mix", "waypoints"):
+    elif hasattr(agent, name):
         config = replace(config, agent=replace(agent, **changes))
     else:
         config = replace(config, **changes)

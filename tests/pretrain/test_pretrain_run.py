@@ -12,10 +12,12 @@ from safetensors.torch import load_file
 
 import pretrain.train
 from eisp_data.errors import ConfigError, DataError
+from eisp_data.runs.episodes import split
 from eisp_data.storage.cache import load_arrays
 from pretrain import checkpoint
 from pretrain.agent import Agent
 from pretrain.config import DatasetConfig
+from pretrain.learner import Learner
 from pretrain.replay import Trajectories
 from pretrain.train import load_trajectories
 from pretrain.train import pretrain as run_pretraining
@@ -97,7 +99,9 @@ def test_episodes_are_held_out_whole_and_none_is_in_both_parts(stack_dataset, tm
     config = tiny_pretraining(stack_dataset, tmp_path, validation_share=0.25)
     train, held_out, _ = load_trajectories(config)
     arrays = load_arrays(stack_dataset)
-    assert len(train.episode_start) - 1 == 9 and len(held_out.episode_start) - 1 == 3
+    held, rest = split(12, 0.25, config.seed)
+    assert len(train.episode_start) - 1 == len(rest) > len(held)
+    assert len(held_out.episode_start) - 1 == len(held)
     assert len(train) + len(held_out) == len(arrays.observation)
 
     def episodes(data: Trajectories) -> set[bytes]:
@@ -142,6 +146,53 @@ def test_the_generator_of_the_best_validation_is_kept(stack_dataset, tmp_path, m
     generator = [name for name in best if name.startswith("proposer.")]
     assert all(torch.equal(best[name], last[name]) for name in generator)
     assert any(not torch.equal(best[name], last[name]) for name in best if "sac.actor" in name)
+
+
+def test_a_run_that_is_to_end_where_it_was_killed_keeps_the_best_generator(
+    stack_dataset, tmp_path, monkeypatch
+):
+    config = tiny_pretraining(stack_dataset, tmp_path)
+    said = iter([3.0, 2.0])
+    monkeypatch.setattr(
+        pretrain.train, "validate", lambda *_: {"log_likelihood": torch.tensor(next(said))}
+    )
+    with monkeypatch.context() as patch:
+        kill_after(patch, 8)
+        with pytest.raises(Killed):
+            run_pretraining(config)
+    best = weights_of(tmp_path, "000004")
+    run_pretraining(replace(config, resume=True, updates=8))
+    last = weights_of(tmp_path)
+    assert all(torch.equal(best[k], last[k]) for k in best if k.startswith("proposer."))
+
+
+def test_learning_rates_fall_to_their_shares(stack_dataset, tmp_path, monkeypatch):
+    config = tiny_pretraining(
+        stack_dataset, tmp_path, updates=4, final_lr_share=0.5, generator_final_lr_share=0.25
+    )
+    rates: list[tuple[float, float]] = []
+    monkeypatch.setattr(Learner, "set_lr", lambda _, *both: rates.append(both))
+    run_pretraining(config)
+    shares = np.array(rates) / [config.agent.sac.lr, config.generator_lr]
+    np.testing.assert_allclose(shares, [(0.75, 0.75), (0.5, 0.5), (0.5, 0.25), (0.5, 0.25)])
+
+
+def test_a_run_that_diverges_is_told_and_the_checkpoint_before_is_of_use(
+    stack_dataset, tmp_path, monkeypatch
+):
+    config = tiny_pretraining(stack_dataset, tmp_path)
+    update, seen = Learner.update, iter(range(100))
+
+    def diverge(learner, *args):
+        info = update(learner, *args)
+        return info | {"critic_loss": torch.tensor(np.nan)} if next(seen) >= 6 else info
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Learner, "update", diverge)
+        with pytest.raises(DataError, match=r"critic_loss is nan after 8 updates: .* diverged"):
+            run_pretraining(config)
+    assert (tmp_path / "checkpoints/last").resolve().name == "000004"
+    run_pretraining(replace(config, resume=True))
 
 
 def test_the_papers_parts_train_as_well(stack_dataset, tmp_path):
@@ -190,8 +241,12 @@ def test_resuming_with_other_networks_is_told_in_one_line(stack_dataset, tmp_pat
     run_pretraining(config)
     sac = replace(config.agent.sac, layers=(24, 24))
     other = replace(config, agent=replace(config.agent, sac=sac), resume=True)
+    before = (tmp_path / "pretrain.yaml").read_text()
     with pytest.raises(DataError, match=r"cannot be resumed from: .*size mismatch"):
         run_pretraining(other)
+    # What was refused has changed nothing.
+    assert (tmp_path / "pretrain.yaml").read_text() == before
+    run_pretraining(replace(config, resume=True, updates=2))
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")

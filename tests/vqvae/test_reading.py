@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from image_samples import TINY
 
 from eisp_data.storage.cache import load_arrays
 from vqvae.latents import load_codes, see
+from vqvae.losses import loss
+from vqvae.model import VqVae
 from vqvae.reading import Reader, check, learn, on_table
 from vqvae.saved import load
 
@@ -74,3 +79,18 @@ def test_the_reader_leaves_the_codes_as_they_are(vqvae_run):
     with torch.no_grad():
         model.reader.centre += 1.0
     assert model.fingerprint() == before
+
+
+@pytest.mark.parametrize("weight", [0.0, 1.0])
+def test_places_shape_the_codes_only_if_they_have_a_weight(weight):
+    torch.manual_seed(0)
+    model = VqVae(replace(TINY, reading=weight), 6)
+    images = torch.randint(0, 256, (4, 48, 48, 3), dtype=torch.uint8)
+    gradients = []
+    for places in (torch.zeros(4, 6), torch.full((4, 6), 5.0)):
+        model.zero_grad()
+        loss(model, images, places, fast=False)[0].backward()
+        gradients.append([model.encoder[0].weight.grad.clone(), model.reader.plain.bias.grad])
+    of_encoder, of_reader = zip(*gradients, strict=True)
+    assert torch.equal(*of_encoder) == (weight == 0.0)
+    assert not torch.equal(*of_reader)

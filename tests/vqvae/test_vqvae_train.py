@@ -9,13 +9,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from image_samples import TINY, tiny_training
+import torch
+from image_samples import TINY, drawn_dataset, tiny_training
 
+from eisp_data.cli.collect import CollectConfig, collect
 from eisp_data.errors import ConfigError, DataError
-from vqvae import cli, saved
+from eisp_data.runs.episodes import rows_of, split
+from eisp_data.storage.cache import load_arrays, load_images
+from vqvae import cli, reading, saved
+from vqvae import evaluate as evaluate_module
 from vqvae import train as training
 from vqvae.config import VqVaeTrainConfig
 from vqvae.presets import preset
+from vqvae.quality import measure
 
 
 def entries(run: Path) -> list[dict[str, float]]:
@@ -73,6 +79,99 @@ def test_a_finished_run_can_be_resumed(images, vqvae_run):
     assert quality.psnr_db == pytest.approx(entries(vqvae_run)[-1]["held_out/psnr_db"], abs=1e-3)
 
 
+def weights_of(run: Path) -> dict[str, torch.Tensor]:
+    return saved.load(run)[0].state_dict()
+
+
+def test_what_cannot_be_resumed_is_told_and_changes_nothing(images, tmp_path):
+    config = tiny_training(images, tmp_path, updates=2, reader_updates=2)
+    training.train(config)
+    before = (tmp_path / training.CONFIG_FILE).read_text()
+    with pytest.raises(DataError, match=r"cannot be resumed from: .*size mismatch"):
+        training.train(replace(config, resume=True, model=replace(TINY, codes=64)))
+    assert (tmp_path / training.CONFIG_FILE).read_text() == before
+    training.train(replace(config, resume=True, updates=4))
+
+
+def test_a_run_that_is_to_end_where_it_was_killed_still_teaches_its_reader(
+    images, tmp_path, monkeypatch
+):
+    config = tiny_training(images, tmp_path, updates=4, validate_every=2, reader_updates=5)
+    with monkeypatch.context() as patch:
+        patch.setattr(reading, "learn", lambda *_: (_ for _ in ()).throw(Cut))
+        with pytest.raises(Cut):
+            training.train(config)
+    before = weights_of(tmp_path)
+    training.train(replace(config, resume=True, updates=2))
+    after = weights_of(tmp_path)
+    changed = {name for name in before if not torch.equal(before[name], after[name])}
+    assert changed and all(name.startswith("reader.") for name in changed)
+
+
+def test_what_is_held_out_or_off_the_table_is_never_learned_from(images, tmp_path, monkeypatch):
+    weights, load = [], training.load_frames
+    for name in ("as it is", "disturbed"):
+
+        def disturbed(config, differs=name == "disturbed"):
+            frames, arrays, episodes, held = load(config)
+            frames, rows = np.array(frames), rows_of(arrays, held)
+            hidden = rows_of(arrays, episodes)[:20]
+            goals = np.array(arrays.achieved_goal)
+            goals[hidden, 2] = -1.0
+            if differs:
+                frames[rows] = 255 - frames[rows]
+                frames[hidden] = 255 - frames[hidden]
+            return frames, replace(arrays, achieved_goal=goals), episodes, held
+
+        monkeypatch.setattr(training, "load_frames", disturbed)
+        monkeypatch.setattr(reading, "learn", lambda *_: None)
+        config = tiny_training(images, tmp_path / name, updates=20, validate_every=20)
+        training.train(config)
+        weights.append(weights_of(tmp_path / name))
+    assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
+    first, second = (entries(tmp_path / name)[-1] for name in ("as it is", "disturbed"))
+    assert first["held_out/psnr_db"] != second["held_out/psnr_db"]
+
+
+def test_every_update_has_its_learning_rate(images, tmp_path, monkeypatch):
+    rates, step = [], training.step
+
+    def noted(model, optimizer, *rest):
+        rates.append(optimizer.param_groups[0]["lr"])
+        return step(model, optimizer, *rest)
+
+    monkeypatch.setattr(training, "step", noted)
+    config = tiny_training(images, tmp_path, updates=4, reader_updates=1)
+    training.train(config)
+    assert rates == [training.learning_rate(config, update) for update in (1, 2, 3, 4)]
+    assert rates[0] > rates[1] > rates[2] > rates[3]
+
+
+def test_the_quality_is_that_of_the_held_out_episodes(images, vqvae_run, monkeypatch):
+    measured = []
+
+    def noted(model, chosen):
+        measured.append(chosen)
+        return measure(model, chosen)
+
+    monkeypatch.setattr(evaluate_module, "measure", noted)
+    evaluate_module.evaluate(vqvae_run)
+    config = tiny_training(images, vqvae_run)
+    held, _ = split(4, config.validation_share, config.seed)
+    rows = rows_of(load_arrays(images), held)
+    np.testing.assert_array_equal(measured[0], load_images(images, "shoulder")[rows])
+
+
+def test_a_vqvae_is_measured_on_data_of_its_task_only(images, vqvae_run, tmp_path):
+    push4 = tmp_path / "push4"
+    collect(CollectConfig(push4, task="push4", policy="random", episodes=1, workers=1))
+    with pytest.raises(DataError, match="is a dataset of 'push4', the VQ-VAE was trained on"):
+        evaluate_module.evaluate(vqvae_run, push4)
+    single = drawn_dataset(tmp_path, episodes=1)
+    with pytest.raises(DataError, match="too few episodes: 1"):
+        evaluate_module.evaluate(vqvae_run, single)
+
+
 def test_the_papers_preset_is_the_papers():
     config = preset("paper", Path("data"), Path("runs"))
     assert (config.lr, config.batch_size, config.updates) == (1e-4, 256, 1_000_000)
@@ -94,6 +193,8 @@ def test_the_learning_rate_falls_to_its_share():
         ({"model": replace(TINY, image_size=(48, 50))}, "multiples of 8; got 48 x 50"),
         ({"model": replace(TINY, reading=-1.0)}, "--model.reading must be at least 0; got -1.0"),
         ({"model": replace(TINY, codes=0)}, "--model.codes must be at least 1; got 0"),
+        ({"model": replace(TINY, codes=70000)}, "--model.codes must be at most 65536; got 70000"),
+        ({"lr": float("nan")}, "--lr must be above 0; got nan"),
     ],
 )
 def test_a_setting_that_cannot_be_used_is_named(tmp_path, changes, said):
