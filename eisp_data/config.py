@@ -68,6 +68,12 @@ def at_least(least: int, options: Mapping[str, int | None]) -> None:
             raise ConfigError(f"{flag} must be at least {least}; got {value}")
 
 
+def check_seed(seed: int) -> None:
+    """Raise ConfigError unless every generator of random numbers takes the seed."""
+    if not 0 <= seed < 2**32:
+        raise ConfigError(f"--seed must be 0 to {2**32 - 1}; got {seed}")
+
+
 def above_zero(options: Mapping[str, float]) -> None:
     """Raise ConfigError, naming the option, unless each is a finite number above 0."""
     for flag, value in options.items():

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from eisp_data.config import at_least
+from eisp_data.config import at_least, check_seed
 from eisp_data.errors import ConfigError
+from eisp_data.storage.files import check_writable
 from eisp_data.tasks.images import state_task
 from eisp_data.tasks.registry import TASKS
 from finetune.config import EvaluateConfig
@@ -21,13 +22,15 @@ _BATCH = 100
 def assess(config: EvaluateConfig) -> Evaluation:
     """Evaluate a policy, and film its first episode if asked to."""
     at_least(1, {"--episodes": config.episodes, "--threads": config.threads})
-    at_least(0, {"--seed": config.seed})
+    check_seed(config.seed)
     check_subgoals(config.subgoals, "--subgoals")
     device = set_up(config.device, config.threads)
     agent = load_for_rollouts(config.policy.path, config.subgoals, device)
     name = agent.config.task
-    if config.video and name not in TASKS:
-        raise ConfigError(f"--video: only our own tasks are drawn, not {name!r}")
+    if config.video:
+        if name not in TASKS:
+            raise ConfigError(f"--video: only our own tasks are drawn, not {name!r}")
+        check_writable(config.video, "--video")
     film = Film()
     result = evaluate(
         agent,
@@ -39,6 +42,5 @@ def assess(config: EvaluateConfig) -> Evaluation:
         watch=film if config.video else None,
     )
     if config.video:
-        config.video.parent.mkdir(parents=True, exist_ok=True)
         film.write(config.video)
     return result

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from eisp_data.config import at_least, load_yaml, save_yaml
+from eisp_data.config import at_least, check_seed, load_yaml, save_yaml
 from eisp_data.errors import ConfigError, EispError, RobotError
 from eisp_data.robots.record_controllers import Controller, Decision, Limited, Script, Slowed
 from eisp_data.robots.session import Ended
@@ -164,6 +164,7 @@ def _prepare(config: DeployConfig) -> tuple[Task, Agent | None]:
             "--threads": config.threads,
         },
     )
+    check_seed(config.seed)
     if config.episode_s is not None and not 0 < config.episode_s < float("inf"):
         raise ConfigError(f"--episode-s must be above 0; got {config.episode_s}")
     if config.task is None:
@@ -181,7 +182,8 @@ def _prepare(config: DeployConfig) -> tuple[Task, Agent | None]:
 def _done_before(config: DeployConfig) -> int:
     """Return how many episodes the output folder has."""
     folder = config.output_dir
-    if not folder.exists() or not any(folder.iterdir()):
+    # Settings alone are left where nothing could begin.
+    if not folder.exists() or not any(path.name != SETTINGS for path in folder.iterdir()):
         return 0
     if not config.resume:
         raise ConfigError(

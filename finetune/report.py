@@ -45,8 +45,8 @@ class Run:
 
     @property
     def task(self) -> str:
-        """Name of the task, or ``a task`` if no evaluation names it."""
-        return str((self.after or self.before or {}).get("task", "a task"))
+        """Name of the task; that of the folder if no evaluation names it."""
+        return str((self.after or self.before or {}).get("task", self.folder.resolve().name))
 
     def stage(self, name: str, *keys: str) -> list[dict[str, Any]]:
         """Return the lines of one stage that have one of the keys."""

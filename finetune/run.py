@@ -11,7 +11,7 @@ import torch
 
 from eisp_data.cli.collect import episode_seeds
 from eisp_data.collect import explore
-from eisp_data.config import above_zero, at_least, load_yaml, zero_to_one
+from eisp_data.config import above_zero, at_least, check_seed, load_yaml, zero_to_one
 from eisp_data.errors import ConfigError
 from eisp_data.runs.folder import begin_run, folders_of_run, has_progress
 from eisp_data.sim.gym_worlds import AnyWorlds, GymWorlds
@@ -29,7 +29,7 @@ from pretrain.learner import threads_of_half
 from pretrain.presets import preset
 from pretrain.replay import Trajectories
 from pretrain.saved import find_policy
-from pretrain.train import gather
+from pretrain.train import CONFIG_FILE, gather
 from pretrain.vision import load_seen
 from vqvae.worlds import ImageWorlds
 
@@ -80,7 +80,8 @@ def finetune(config: FinetuneConfig) -> dict[str, float]:
 
 def _check(config: FinetuneConfig) -> None:
     online = config.online
-    at_least(0, {"--seed": config.seed, "--online.generator-every": online.generator_every})
+    check_seed(config.seed)
+    at_least(0, {"--online.generator-every": online.generator_every})
     at_least(
         1,
         {
@@ -115,7 +116,12 @@ def make_worlds(agent: Agent, count: int) -> AnyWorlds:
     if name in TASKS:
         check_layout(agent, Layout.of(TASKS[name]))
         return Worlds(TASKS[name], count)
-    worlds = GymWorlds(name, count)
+    try:
+        worlds = GymWorlds(name, count)
+    except ConfigError as error:
+        raise ConfigError(
+            f"the policy is of {name!r}, which is no task that can be simulated here ({error})"
+        ) from None
     check_layout(agent, Layout(worlds.observation_dim, worlds.goal_dim, worlds.action_dim))
     return worlds
 
@@ -154,8 +160,8 @@ def _dataset(config: FinetuneConfig, agent: Agent) -> Trajectories:
 def _pretraining_dataset(path: Path | None) -> Path:
     assert path is not None
     for folder in folders_of_run(path):
-        if (folder / "pretrain.yaml").exists():
-            return load_yaml(PretrainConfig, folder / "pretrain.yaml").dataset.root
+        if (folder / CONFIG_FILE).exists():
+            return load_yaml(PretrainConfig, folder / CONFIG_FILE).dataset.root
     raise ConfigError(f"{path} does not say what it was pretrained on; give --dataset.root")
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from eisp_data.config import above_zero, at_least, zero_to_one
+from eisp_data.config import above_zero, at_least, check_seed, zero_to_one
 from eisp_data.errors import ConfigError
 from pretrain.config import GoalMix, PretrainConfig, SubgoalConfig
 
@@ -11,7 +11,7 @@ _ROUNDING = 1e-6
 
 def check_pretrain(config: PretrainConfig) -> None:
     """Raise ConfigError unless the settings can be used."""
-    at_least(0, {"--seed": config.seed})
+    check_seed(config.seed)
     at_least(
         1,
         {
@@ -33,7 +33,19 @@ def check_pretrain(config: PretrainConfig) -> None:
     ):
         if not layers or min(layers) < 1:
             raise ConfigError(f"{flag} must be one or more sizes of at least 1; got {layers}")
-    above_zero({"--agent.sac.lr": config.agent.sac.lr, "--generator-lr": config.generator_lr})
+    above_zero(
+        {
+            "--agent.sac.lr": config.agent.sac.lr,
+            "--generator-lr": config.generator_lr,
+            "--agent.mix.tolerance-m": config.agent.mix.tolerance_m,
+        }
+    )
+    for flag, weight in (
+        ("--agent.sac.cloning", config.agent.sac.cloning),
+        ("--agent.mix.errors", config.agent.mix.errors),
+    ):
+        if not 0 <= weight < float("inf"):
+            raise ConfigError(f"{flag} must be at least 0; got {weight}")
     zero_to_one(
         {
             "--agent.sac.tau": config.agent.sac.tau,

@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from eisp_data.config import load_yaml
 from eisp_data.errors import DataError
 from eisp_data.runs.episodes import rows_of, split
-from eisp_data.runs.folder import begin_run, has_progress
+from eisp_data.runs.folder import begin_run, check_same_dataset, has_progress
 from eisp_data.runs.metrics import MetricsLog
 from eisp_data.storage.cache import DatasetArrays
 from eisp_data.tasks.images import state_task
@@ -30,17 +31,21 @@ from vqvae.model import VqVae
 
 _VALIDATION_SAMPLES = 4096
 _NEAR_M = 0.05
+CONFIG_FILE = "pretrain.yaml"
 
 
 def pretrain(config: PretrainConfig) -> Path:
     """Pretrain an agent; return the folder of the run."""
     run = config.output_dir
     check_pretrain(config)
-    resumed = has_progress(run, config.resume, "pretrain.yaml")
+    resumed = has_progress(run, config.resume, CONFIG_FILE)
+    if resumed:
+        begun = load_yaml(PretrainConfig, run / CONFIG_FILE)
+        check_same_dataset(begun.dataset.root, config.dataset.root, run / CONFIG_FILE)
     device = set_up(config.device, threads_of_half(config.threads))
-    print(describe(device, config.threads), flush=True)
     vision = load_vision(config)
     train, held_out, layout = load_trajectories(config, vision)
+    print(describe(device, config.threads), flush=True)
     torch.manual_seed(config.seed)
     rng = np.random.default_rng(config.seed)
     bank = train.achieved_goal[rng.integers(len(train), size=BANK)]
@@ -54,7 +59,7 @@ def pretrain(config: PretrainConfig) -> Path:
         check_resumed(agent, vision, config.vqvae.path)
         best, spent, finished = numbers["best"], numbers["wall_s"], numbers["finished"]
         best_state = {name: torch.from_numpy(value) for name, value in arrays.items()}
-    begin_run(run, config, "pretrain.yaml")
+    begin_run(run, config, CONFIG_FILE)
     log = MetricsLog(run, "pretrain", done)
     start = time.monotonic() - spent
     info: dict[str, Tensor] = {}
@@ -65,7 +70,8 @@ def pretrain(config: PretrainConfig) -> Path:
         checkpoint.save(run, done, agent, learner.optimizers, rng, numbers, arrays)
 
     steps = range(done + 1, config.updates + 1)
-    for update in tqdm(steps, "pretraining", config.updates, initial=done, mininterval=1.0):
+    bar = tqdm(steps, "pretraining", config.updates, initial=done, mininterval=1.0)
+    for update in bar:
         remaining = 1.0 - update / config.updates
         learner.set_lr(
             config.agent.sac.lr * max(config.final_lr_share, remaining),
@@ -82,6 +88,7 @@ def pretrain(config: PretrainConfig) -> Path:
                 best = float(held["log_likelihood"])
                 state = agent.proposer.state_dict()
                 best_state = {name: value.clone() for name, value in state.items()}
+            bar.set_postfix(_in_words(held))
             done, spent = update, time.monotonic() - start
             values = {f"train/{k}": v for k, v in info.items()}
             values |= {f"held_out/{k}": v for k, v in held.items()}
@@ -94,7 +101,17 @@ def pretrain(config: PretrainConfig) -> Path:
         agent.proposer.load_state_dict(best_state)
         finished = True
         save()
+    said = ", ".join(f"{k} {v}" for k, v in _in_words(validate(agent, held_out, device)).items())
+    print(f"held-out subgoals: {said}")
     return run
+
+
+def _in_words(held: dict[str, Tensor]) -> dict[str, str]:
+    """Return what ``validate`` found as is said of it."""
+    return {
+        "likelihood": f"{float(held['log_likelihood']):.2f}",
+        "near the data": f"{float(held['near_data']):.0%}",
+    }
 
 
 @torch.no_grad()

@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from eisp_data.config import above_zero, at_least
+from eisp_data.config import above_zero, at_least, check_seed, load_yaml
 from eisp_data.errors import ConfigError, DataError
 from eisp_data.runs import MODEL, checkpoint
 from eisp_data.runs.device import choose_device
 from eisp_data.runs.episodes import rows_of, split
-from eisp_data.runs.folder import begin_run, has_progress
+from eisp_data.runs.folder import begin_run, check_same_dataset, has_progress
 from eisp_data.runs.memory import keep_freed_memory
 from eisp_data.runs.metrics import MetricsLog
 from eisp_data.storage.cache import DatasetArrays, load_arrays, load_images
@@ -43,6 +43,9 @@ def train(config: VqVaeTrainConfig) -> tuple[Path, Quality]:
     run = config.output_dir
     check(config)
     resumed = has_progress(run, config.resume, CONFIG_FILE)
+    if resumed:
+        begun = load_yaml(VqVaeTrainConfig, run / CONFIG_FILE)
+        check_same_dataset(begun.dataset.root, config.dataset.root, run / CONFIG_FILE)
     device = choose_device(config.device)
     torch.set_num_threads(config.threads)
     keep_freed_memory()
@@ -150,7 +153,7 @@ def check(config: VqVaeTrainConfig) -> None:
             "--model.revive-after": model.revive_after,
         },
     )
-    at_least(0, {"--seed": config.seed})
+    check_seed(config.seed)
     above_zero({"--lr": config.lr})
     if model.codes > _MOST_CODES:
         raise ConfigError(f"--model.codes must be at most {_MOST_CODES}; got {model.codes}")

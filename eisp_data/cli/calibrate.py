@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from eisp_data.cli.run import run
-from eisp_data.config import at_least
+from eisp_data.config import at_least, check_seed
 from eisp_data.errors import ConfigError
 from eisp_data.robots.robot_config import RobotConfig, choose_camera, make_configured
+from eisp_data.storage.files import check_writable
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,8 +38,10 @@ def calibrate(config: CalibrateConfig) -> None:
     Nothing but its four markers may be on the table. docs/perception.md says what to print.
     """
     at_least(1, {"--views": config.views})
-    if not config.output.resolve().parent.is_dir():
-        raise ConfigError(f"--output: there is no folder {config.output.resolve().parent}")
+    check_seed(config.seed)
+    if config.output.is_file():
+        raise ConfigError(f"--output: {config.output} exists already; choose another, or remove it")
+    check_writable(config.output, "--output")
     from tqdm import tqdm
 
     from eisp_data.robots.calibrate import calibrate_cell

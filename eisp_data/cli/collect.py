@@ -126,8 +126,10 @@ class _TaskSource:
         from eisp_data.policies.registry import DEMONSTRATOR, SCRIPTS
         from eisp_data.policies.script import Noise
         from eisp_data.tasks.images import CAMERA, IMAGE_SIZE, IMAGE_TASKS, state_task
-        from eisp_data.tasks.registry import get_task
+        from eisp_data.tasks.registry import TASKS, get_task
 
+        if config.task not in (known := [*TASKS, *IMAGE_TASKS]):
+            raise ConfigError(f"unknown task {config.task!r}; choose one of {', '.join(known)}")
         self._config, self._task = config, get_task(state_task(str(config.task)))
         self.policy = config.policy or "scripted"
         self.spec = _task_spec(self._task)

@@ -33,6 +33,21 @@ def folders_of_run(path: Path) -> tuple[Path, ...]:
     return (path, *path.resolve().parents[:3])
 
 
+def check_same_dataset(begun: Path, given: Path, file: Path) -> None:
+    """Raise ConfigError if a run to resume learns from another dataset.
+
+    Args:
+        begun: the dataset that it began with.
+        given: the one that it is to go on with.
+        file: its configuration, which says the former.
+    """
+    if begun.resolve() != given.resolve():
+        raise ConfigError(
+            f"--resume: the run learns from {begun}, not from {given}; if the dataset has moved, "
+            f"say so in {file}"
+        )
+
+
 def begin_run(run: Path, config: object, name: str) -> None:
     """Make the folder of a run and write its configuration, once all input has proved usable."""
     try:

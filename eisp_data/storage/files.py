@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from eisp_data.errors import DataError
+from eisp_data.errors import ConfigError, DataError
 
 _LOCKED_HERE: set[str] = set()
 
@@ -46,6 +46,21 @@ def replace_atomically(path: Path, write: Callable[[Path], object]) -> None:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def check_writable(path: Path, flag: str) -> None:
+    """Make the folder of a file; raise ConfigError, naming the option, unless it can be written.
+
+    To be called before the work whose result goes there.
+    """
+    new = not path.exists()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.open("ab").close()
+    except OSError as error:
+        raise ConfigError(f"{flag}: cannot write {path}: {error.strerror}") from None
+    if new:
+        path.unlink()
 
 
 def remove_temporaries(folder: Path) -> None:

@@ -178,7 +178,7 @@ class DatasetWriter:
         ):
             differing = [k for k in {**here, **given} if here.get(k) != given.get(k)]
             if differing:
-                key = sorted(differing)[0]
+                key = "task" if "task" in differing else sorted(differing)[0]
                 raise DataError(
                     f"{self.root}: cannot resume, its {name} differs in {key!r}: "
                     f"{here.get(key)!r} there, {given.get(key)!r} now"

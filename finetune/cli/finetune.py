@@ -27,7 +27,7 @@ def _command(config: FinetuneConfig) -> None:
     """Fine-tune a pretrained policy online, with subgoals.
 
     --subgoals.source random and --subgoals.source none show what the subgoals are worth. Without a
-    policy it begins with all of the noise and a learning rate of 1e-3.
+    policy (--env.id alone) it begins with all of the noise and a learning rate of 1e-3.
     """
     from finetune.run import finetune
 
@@ -47,7 +47,9 @@ def _start(words: list[str]) -> FinetuneConfig | None:
         return saved
     _, path = take(words, "--policy.path")
     folder = Path("runs/finetune")
-    if path is None:
-        _, env_id = take(words, "--env.id")
-        return from_nothing(folder, preset("cpu", env_id or "", Path(), folder).agent)
-    return FinetuneConfig(folder, subgoals=saved_subgoals(Path(path)))
+    if path is not None:
+        return FinetuneConfig(folder, subgoals=saved_subgoals(Path(path)))
+    _, env_id = take(words, "--env.id")
+    if env_id is not None:
+        return from_nothing(folder, preset("cpu", env_id, Path(), folder).agent)
+    return FinetuneConfig(folder)

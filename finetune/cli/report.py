@@ -63,6 +63,8 @@ def report(config: ReportConfig) -> None:
     found = read_run(config.run_dir)
     if found.before or found.after:
         print(results_text(found.before, found.after))
+    else:
+        print(f"no evaluation: eisp-eval --json > {config.run_dir / 'evaluation_after.json'}")
     print(f"report: {path}")
 
 

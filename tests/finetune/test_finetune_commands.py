@@ -1,6 +1,7 @@
 """``eisp-finetune`` and ``eisp-eval`` from the command line."""
 
 import json
+import shutil
 import subprocess
 import sys
 
@@ -76,8 +77,14 @@ def test_without_a_policy_it_learns_fast_and_explores(tmp_path, monkeypatch):
         (evaluate, [], "missing --policy.path"),
         (evaluate, ["--policy.path", "nowhere"], "nowhere holds no policy"),
         (evaluate, ["--policy.path", "RUN", "--episodes", "0"], "--episodes must be at least 1"),
-        (evaluate, ["--policy.path", "RUN", "--seed", "-4"], "--seed must be at least 0; got -4"),
+        (
+            evaluate,
+            ["--policy.path", "RUN", "--seed", "-4"],
+            "--seed must be 0 to 4294967295; got -4",
+        ),
         (evaluate, ["--policy.path", "RUN", "--episode", "1"], "did you mean --episodes?"),
+        (evaluate, ["--policy.path", "RUN", "--seed", "9" * 23], "--seed must be 0 to 4294967295"),
+        (evaluate, ["--policy.path", "RUN", "--video", "."], "--video: cannot write .: Is a dir"),
     ],
 )
 def test_mistakes_are_told_in_one_line(
@@ -87,6 +94,24 @@ def test_mistakes_are_told_in_one_line(
     words = [str(pretrained) if word == "RUN" else word for word in words]
     assert said in mistake(monkeypatch, capsys, command, *words)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_policy_of_recordings_is_not_taken_for_an_environments(
+    pretrained, tmp_path, monkeypatch, capsys
+):
+    policy = shutil.copytree(pretrained / "checkpoints/last/pretrained_model", tmp_path / "policy")
+    config = (policy / "config.json").read_text()
+    (policy / "config.json").write_text(config.replace('"task": "stack"', '"task": "blocks"'))
+    said = mistake(monkeypatch, capsys, evaluate, "--policy.path", policy)
+    assert "the policy is of 'blocks', which is no task that can be simulated here" in said
+
+
+def test_help_shows_the_defaults_for_a_policy_and_for_none(monkeypatch, capsys):
+    for words, rate in (([], "5e-05"), (["--env.id", "FetchReach-v4"], "0.001")):
+        with pytest.raises(SystemExit):
+            run(monkeypatch, finetune, *words, "--help")
+        said = " ".join(capsys.readouterr().out.split())
+        assert f"It falls linearly to a tenth. (default: {rate})" in said.replace("│ ", "")
 
 
 @pytest.mark.parametrize("module", ["finetune", "evaluate"])

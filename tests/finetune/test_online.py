@@ -286,7 +286,7 @@ def test_a_policy_of_a_recording_with_arrays_of_its_own_is_told_from_the_tasks()
         ({"online": replace(SMALL, replay_size=50)}, "--online.replay-size must be at least 51"),
         ({"online": replace(SMALL, offline_share=1.5)}, "--online.offline-share must be 0 to 1"),
         ({"subgoals": SubgoalConfig(every_steps=0)}, "--subgoals.every-steps must be at least 1"),
-        ({"seed": -1}, "--seed must be at least 0; got -1"),
+        ({"seed": -1}, "--seed must be 0 to 4294967295; got -1"),
         ({"resume": True}, "holds no run, finetune.yaml is missing"),
     ],
 )

@@ -79,7 +79,7 @@ def test_another_environment_gets_what_needs_no_objects_and_no_rest():
         ({"generator_every": 0}, "--generator-every must be at least 1"),
         ({"validate_every": 0}, "--validate-every must be at least 1"),
         ({"threads": 0}, "--threads must be at least 1"),
-        ({"seed": -1}, "--seed must be at least 0; got -1"),
+        ({"seed": -1}, "--seed must be 0 to 4294967295; got -1"),
         ({"validation_share": 1.0}, "--validation-share must be between 0 and 1; got 1.0"),
         ({"validation_share": float("nan")}, "--validation-share"),
         ({"gamma": 1.0}, "--agent.sac.gamma must be at least 0 and below 1; got 1.0"),

@@ -135,12 +135,19 @@ def test_what_is_held_out_is_never_learned_from(stack_dataset, tmp_path, monkeyp
     assert lines[0]["held_out/log_likelihood"] != lines[1]["held_out/log_likelihood"]
 
 
+def say_likelihoods(monkeypatch: pytest.MonkeyPatch, *likelihoods: float) -> None:
+    """Let the validations find these, one after the other."""
+    said = iter(likelihoods)
+
+    def validate(*_: object) -> dict[str, torch.Tensor]:
+        return {"log_likelihood": torch.tensor(next(said)), "near_data": torch.tensor(0.5)}
+
+    monkeypatch.setattr(pretrain.train, "validate", validate)
+
+
 def test_the_generator_of_the_best_validation_is_kept(stack_dataset, tmp_path, monkeypatch):
     config = tiny_pretraining(stack_dataset, tmp_path)
-    said = iter([1.0, 3.0, 2.0])
-    monkeypatch.setattr(
-        pretrain.train, "validate", lambda *_: {"log_likelihood": torch.tensor(next(said))}
-    )
+    say_likelihoods(monkeypatch, 1.0, 3.0, 2.0, 3.0)
     run_pretraining(config)
     best, last = weights_of(tmp_path, "000008"), weights_of(tmp_path)
     generator = [name for name in best if name.startswith("proposer.")]
@@ -152,10 +159,7 @@ def test_a_run_that_is_to_end_where_it_was_killed_keeps_the_best_generator(
     stack_dataset, tmp_path, monkeypatch
 ):
     config = tiny_pretraining(stack_dataset, tmp_path)
-    said = iter([3.0, 2.0])
-    monkeypatch.setattr(
-        pretrain.train, "validate", lambda *_: {"log_likelihood": torch.tensor(next(said))}
-    )
+    say_likelihoods(monkeypatch, 3.0, 2.0, 3.0)
     with monkeypatch.context() as patch:
         kill_after(patch, 8)
         with pytest.raises(Killed):
@@ -247,6 +251,14 @@ def test_resuming_with_other_networks_is_told_in_one_line(stack_dataset, tmp_pat
     # What was refused has changed nothing.
     assert (tmp_path / "pretrain.yaml").read_text() == before
     run_pretraining(replace(config, resume=True, updates=2))
+
+
+def test_a_run_goes_on_with_its_dataset_alone(stack_dataset, tmp_path):
+    config = tiny_pretraining(stack_dataset, tmp_path / "run", updates=1)
+    run_pretraining(config)
+    other = replace(config, dataset=DatasetConfig(tmp_path), resume=True)
+    with pytest.raises(ConfigError, match=r"the run learns from .*stack, not from"):
+        run_pretraining(other)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")

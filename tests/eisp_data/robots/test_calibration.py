@@ -159,8 +159,11 @@ def test_the_calibration_of_another_cell_is_refused(calibration, change, said):
 
 
 def test_a_bad_command_line_is_one_line(tmp_path):
+    (tmp_path / "mine.yaml").write_text("mine")
     for config, said in (
-        (command.CalibrateConfig(output=tmp_path / "no/cell.yaml"), "there is no folder"),
+        (command.CalibrateConfig(output=tmp_path), "--output: cannot write .*Is a directory"),
+        (command.CalibrateConfig(output=tmp_path / "mine.yaml"), "exists already"),
+        (command.CalibrateConfig(output=tmp_path / "cell.yaml", seed=2**40), "--seed must be"),
         (
             command.CalibrateConfig(output=tmp_path / "cell.yaml", views=0),
             "--views must be at least 1",
