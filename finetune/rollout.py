@@ -11,6 +11,8 @@ from pretrain.agent import Agent
 
 _LET_GO_STEPS = 10
 """When the final goal has been met for so many steps, and well, what is so is the goal."""
+_FAILED = 4
+"""How many subgoals that failed are remembered."""
 _REST_STEPS = 30
 """After so many the gripper stands still."""
 
@@ -25,6 +27,8 @@ class SubgoalPolicy:
         stuck: (N,) bool, whether the one before was not reached nor come nearer.
         met: (N,) int64, for how many steps in a row the final goal has been met.
         idle: (N,) int64, for how many steps no subgoal was chosen but what was so already.
+        failed: (N, 4, G) float32, the last ones that were not reached nor come nearer since one
+            was reached; infinite where there are less.
     """
 
     def __init__(self, agent: Agent, worlds: int, device: str = "cpu") -> None:
@@ -36,11 +40,12 @@ class SubgoalPolicy:
         self.stuck = np.zeros(worlds, bool)
         self.met: np.ndarray = np.zeros(worlds, np.int64)
         self.idle = np.zeros(worlds, np.int64)
+        self.failed = np.full((worlds, _FAILED, agent.layout.goal_dim), np.inf, np.float32)
 
     def reset(self, worlds: np.ndarray) -> None:
         """Forget the subgoals of the named worlds."""
         self.age[worlds] = self._config.every_steps
-        self.start[worlds] = np.inf
+        self.start[worlds] = self.failed[worlds] = np.inf
         self.met[worlds] = self.idle[worlds] = 0
 
     def reached(self, achieved_goal: np.ndarray) -> np.ndarray:
@@ -101,8 +106,9 @@ class SubgoalPolicy:
         """Mark the worlds in which a subgoal was not reached nor come nearer.
 
         A policy without noise that has come to a standstill stays there. Its own noise frees it:
-        until the next subgoal its actions are sampled. Where the final goal is met, nothing is to
-        move: noise would topple the tower.
+        until the next subgoal its actions are sampled. A subgoal that fails once more is not chosen
+        again soon: it may be one that nobody can reach, a block in a shut drawer. Where the final
+        goal is met, nothing is to move: noise would topple the tower.
         """
         was, now = (
             self._distance(self.subgoal[renew], place)
@@ -112,6 +118,10 @@ class SubgoalPolicy:
         arrived = reached[renew] | (self.met[renew] > 0)
         self.stuck[renew] = still & ~arrived & self._config.sample_when_stuck
         self.start[renew] = achieved_goal[renew]
+        self.failed[renew[arrived]] = np.inf
+        stuck = renew[self.stuck[renew]]
+        self.failed[stuck] = np.roll(self.failed[stuck], 1, axis=1)
+        self.failed[stuck, 0] = self.subgoal[stuck]
 
     def _renew(
         self,
@@ -144,7 +154,9 @@ class SubgoalPolicy:
         candidates, likelihood = self._propose(state, goal)
         here = self._tensor(achieved_goal)
         idle = self._tensor(self.idle[renew] >= self._config.every_steps)
-        return select(self._agent, state, here, candidates, likelihood, idle).cpu().numpy()
+        failed = self._tensor(self.failed[renew])
+        chosen = select(self._agent, state, here, candidates, likelihood, idle, failed)
+        return chosen.cpu().numpy()
 
     def _propose(self, state: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
         count = self._config.candidates

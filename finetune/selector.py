@@ -3,8 +3,9 @@
 ``value`` is the paper's Eq. (11): the candidate of highest value. V alone is highest for a subgoal
 that is already reached, which is what the paper's failure analysis finds (its Fig. "failed").
 
-``likely`` first drops what leads nowhere: candidates that are where one is already, and those that
-the generator gives less than a tenth of the weight of its best. What is left are different ways on
+``likely`` first drops what leads nowhere: candidates that are where one is already, those that the
+generator gives less than a tenth of the weight of its best, and above all those that have been
+pursued in vain twice. What is left are different ways on
 (which block next), and of these it takes the one of highest
 
     log w + V / 10,
@@ -24,6 +25,7 @@ from pretrain.agent import Agent
 
 _LEAST_WEIGHT = math.log(0.1)
 _STEPS_PER_NAT = 10.0
+_TRIES = 2
 
 
 def select(
@@ -33,6 +35,7 @@ def select(
     candidates: Tensor,
     likelihood: Tensor,
     idle: Tensor,
+    failed: Tensor,
 ) -> Tensor:
     """Choose one candidate a row.
 
@@ -44,6 +47,7 @@ def select(
         likelihood: (B, K) log-probabilities that the generator gave them.
         idle: (B,) bool, where the best has been what is so already for too long: there a tenth
             of the best of the others will do.
+        failed: (B, M, G) subgoals that were pursued in vain.
 
     Returns:
         (B, G)
@@ -56,9 +60,11 @@ def select(
     if agent.config.subgoals.selector == "likely":
         way = agent.layout.apart(candidates, achieved_goal[:, None]).norm(dim=-1)
         trivial = way <= agent.config.subgoals.reached_m
-        compared = likelihood - _DROPPED * (trivial & idle[:, None])
+        apart = agent.layout.apart(candidates[:, :, None], failed[:, None]).norm(dim=-1)
+        vain = (apart <= agent.config.subgoals.final_m).sum(-1) >= _TRIES
+        compared = likelihood - _DROPPED * (vain | (trivial & idle[:, None]))
         unlikely = likelihood < compared.amax(1, keepdim=True) + _LEAST_WEIGHT
-        dropped = trivial.float() + unlikely.float()
+        dropped = trivial.float() + unlikely.float() + 2.0 * vain
         score = likelihood + score / _STEPS_PER_NAT - _DROPPED * dropped
     return candidates[torch.arange(batch), score.argmax(1)]
 

@@ -97,6 +97,7 @@ class Rollouts:
             "stuck": self.policy.stuck,
             "met": self.policy.met,
             "idle": self.policy.idle,
+            "failed": self.policy.failed,
             "solved": self.solved,
             "next_seed": np.array(self.next_seed),
         }
@@ -112,7 +113,7 @@ class Rollouts:
         self.worlds.restore_snapshot(
             {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
         )
-        for name in ("subgoal", "age", "start", "stuck", "met", "idle"):
+        for name in ("subgoal", "age", "start", "stuck", "met", "idle", "failed"):
             setattr(self.policy, name, arrays[name])
         self.next_seed, self.solved = int(arrays["next_seed"]), arrays["solved"]
 

@@ -84,7 +84,8 @@ class SubgoalConfig:
     final_m: float = 0.05
     """A subgoal this near to the final goal gives way to it (the paper's epsilon)."""
     sample_when_stuck: bool = True
-    """Sample the actions towards a subgoal, if the last one was not reached nor come nearer."""
+    """Sample the actions towards a subgoal, if the last one was not reached nor come nearer; one
+    that fails twice is not chosen again soon."""
     rest_when_met: bool = True
     """When the final goal has been met for a while, let go and stand still. An action of zero has
     to mean that."""

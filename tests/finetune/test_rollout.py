@@ -144,6 +144,27 @@ def test_a_policy_at_a_standstill_samples_its_actions_until_something_moves():
     assert (moved == moved[0]).all()
 
 
+class Insisting(Counting):
+    """Proposes (1, 0), and with far less weight (3, 0)."""
+
+    def propose(self, observation, goal, count):
+        candidates = torch.tensor([[1.0, 0.0], [3.0, 0.0]]).expand(len(goal), 2, 2)
+        return candidates.clone(), torch.tensor([0.0, -5.0]).expand(len(goal), 2)
+
+
+def test_a_subgoal_that_fails_twice_is_left_until_one_is_reached():
+    policy = counting_policy(selector="likely")
+    policy._agent.proposer = Insisting()
+    there = np.array([[3.0, 0.0], [0.0, 0.0]], np.float32)
+    seen = []
+    for at in (None, None, None, there, there):
+        for _ in range(5):
+            step(policy, at)
+        seen.append(policy.subgoal[:, 0].tolist())
+    # World 0 is at (3, 0) from the fourth on, and may try (1, 0) anew.
+    assert seen == [[1, 1], [1, 1], [3, 3], [1, 3], [1, 1]]
+
+
 def test_where_the_final_goal_is_met_nobody_is_stuck_however_still():
     policy = counting_policy()
     # Within final_m of the goal, and not within reached_m of the subgoal.

@@ -12,6 +12,7 @@ from pretrain.config import SubgoalConfig
 
 HERE = torch.zeros(1, 2)
 EQUAL = torch.zeros(1, 3)
+NEVER = torch.full((1, 2, 2), torch.inf)
 BUSY, IDLE = torch.tensor([False]), torch.tensor([True])
 
 
@@ -27,8 +28,9 @@ def choose(
     candidates: list[list[float]],
     likelihood: torch.Tensor = EQUAL,
     idle: torch.Tensor = BUSY,
+    failed: torch.Tensor = NEVER,
 ):
-    found = select(agent, HERE, HERE, torch.tensor([candidates]), likelihood, idle)
+    found = select(agent, HERE, HERE, torch.tensor([candidates]), likelihood, idle, failed)
     return found[0].tolist()
 
 
@@ -37,9 +39,8 @@ def test_the_published_rule_takes_the_candidate_of_highest_value(weight):
     agent = agent_that_values("value", weight)
     torch.manual_seed(0)
     candidates = torch.rand(50, 6, 2)
-    found = select(
-        agent, torch.zeros(50, 2), torch.zeros(50, 2), candidates, torch.zeros(50, 6), BUSY
-    )
+    here = torch.zeros(50, 2)
+    found = select(agent, here, here, candidates, torch.zeros(50, 6), BUSY, NEVER)
     best = (candidates @ torch.tensor(weight)).argmax(1)
     assert torch.equal(found, candidates[torch.arange(50), best])
 
@@ -74,6 +75,18 @@ def test_what_is_so_already_and_far_likelier_is_dropped_when_nothing_else_was_ch
     assert choose(agent, candidates, likelihood, IDLE) == [0.5, 0.0]
 
 
+def test_what_was_pursued_in_vain_twice_gives_way_to_what_is_far_less_likely():
+    agent = agent_that_values("likely", (0.0, 0.0))
+    candidates = [[0.5, 0.0], [0.9, 0.0]]
+    likelihood = torch.tensor([[0.97, 0.03]]).log()
+    once = torch.tensor([[[0.5, 0.0], [torch.inf, torch.inf]]])
+    twice = torch.tensor([[[0.5, 0.0], [0.52, 0.0]]])
+    assert choose(agent, candidates, likelihood, failed=once) == [0.5, 0.0]
+    assert choose(agent, candidates, likelihood, failed=twice)[0] == pytest.approx(0.9)
+    # Better what was pursued in vain than nothing.
+    assert choose(agent, candidates[:1] * 2, likelihood, failed=twice) == [0.5, 0.0]
+
+
 @pytest.mark.parametrize("steps", [5.0, 15.0])
 def test_ten_steps_weigh_as_much_as_a_factor_e_of_likelihood(steps):
     agent = agent_that_values("likely", (-steps, 0.0))
@@ -97,7 +110,8 @@ def test_a_single_candidate_is_chosen_without_asking():
 def test_every_row_chooses_for_itself():
     agent = agent_that_values("value", (1.0, 0.0))
     candidates = torch.tensor([[[0.2, 0.0], [0.4, 0.0]], [[0.9, 0.0], [0.1, 0.0]]])
-    found = select(agent, HERE.expand(2, 2), HERE.expand(2, 2), candidates, torch.zeros(2, 2), BUSY)
+    here = HERE.expand(2, 2)
+    found = select(agent, here, here, candidates, torch.zeros(2, 2), BUSY, NEVER)
     assert found[:, 0].tolist() == pytest.approx([0.4, 0.9])
 
 
