@@ -61,10 +61,11 @@ def load_yaml[T](kind: type[T], path: Path, absent: Any = None) -> T:
         raise ConfigError(f"{path}: {error}") from None
 
 
-def at_least(least: int, options: Mapping[str, int | None]) -> None:
-    """Raise ConfigError, naming the option, unless each that is given is at least this."""
+def at_least(least: int, options: Mapping[str, float | None]) -> None:
+    """Raise ConfigError, naming the option, unless each that is given is finite and at least
+    this."""
     for flag, value in options.items():
-        if value is not None and value < least:
+        if value is not None and not least <= value < float("inf"):
             raise ConfigError(f"{flag} must be at least {least}; got {value}")
 
 

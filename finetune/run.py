@@ -129,14 +129,10 @@ def make_worlds(agent: Agent, count: int) -> AnyWorlds:
 def check_layout(agent: Agent, wanted: Layout) -> None:
     """Raise ConfigError unless an agent's arrays have the sizes of an environment's: a recording
     that it learned from may have had others under the same name."""
-    sizes, others = (
-        (layout.observation_dim, layout.goal_dim, layout.action_dim)
-        for layout in (agent.layout, wanted)
-    )
-    if sizes != others:
+    if agent.layout.sizes != wanted.sizes:
         raise ConfigError(
-            f"the policy takes observations, goals and actions of {sizes} numbers; those of "
-            f"{agent.config.task!r} have {others}"
+            f"the policy takes observations, goals and actions of {agent.layout.sizes} numbers; "
+            f"those of {agent.config.task!r} have {wanted.sizes}"
         )
 
 

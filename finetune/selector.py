@@ -5,8 +5,8 @@ that is already reached, which is what the paper's failure analysis finds (its F
 
 ``likely`` first drops what leads nowhere: candidates that are where one is already, those that the
 generator gives less than a tenth of the weight of its best, and above all those that have been
-pursued in vain twice. What is left are different ways on
-(which block next), and of these it takes the one of highest
+pursued in vain twice. What is left are different ways on (which block next), and of these it takes
+the one of highest
 
     log w + V / 10,
 

@@ -37,6 +37,9 @@ _SELECTION_SEED = 500_000_000
 _TRAINING_SEED = 1_000_000_000
 """Seeds from here on are the worlds that are learned in."""
 
+_OF_POLICY = "subgoal", "age", "start", "stuck", "met", "idle", "failed"
+"""What a ``SubgoalPolicy`` has to remember."""
+
 
 @dataclass
 class Rollouts:
@@ -91,13 +94,7 @@ class Rollouts:
         """Return what ``restore`` needs."""
         worlds = {f"worlds/{name}": value for name, value in self.worlds.snapshot().items()}
         return worlds | {
-            "subgoal": self.policy.subgoal,
-            "age": self.policy.age,
-            "start": self.policy.start,
-            "stuck": self.policy.stuck,
-            "met": self.policy.met,
-            "idle": self.policy.idle,
-            "failed": self.policy.failed,
+            **{name: getattr(self.policy, name) for name in _OF_POLICY},
             "solved": self.solved,
             "next_seed": np.array(self.next_seed),
         }
@@ -113,7 +110,7 @@ class Rollouts:
         self.worlds.restore_snapshot(
             {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
         )
-        for name in ("subgoal", "age", "start", "stuck", "met", "idle", "failed"):
+        for name in _OF_POLICY:
             setattr(self.policy, name, arrays[name])
         self.next_seed, self.solved = int(arrays["next_seed"]), arrays["solved"]
 

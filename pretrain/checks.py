@@ -40,12 +40,13 @@ def check_pretrain(config: PretrainConfig) -> None:
             "--agent.mix.tolerance-m": config.agent.mix.tolerance_m,
         }
     )
-    for flag, weight in (
-        ("--agent.sac.cloning", config.agent.sac.cloning),
-        ("--agent.mix.errors", config.agent.mix.errors),
-    ):
-        if not 0 <= weight < float("inf"):
-            raise ConfigError(f"{flag} must be at least 0; got {weight}")
+    at_least(
+        0,
+        {
+            "--agent.sac.cloning": config.agent.sac.cloning,
+            "--agent.mix.errors": config.agent.mix.errors,
+        },
+    )
     zero_to_one(
         {
             "--agent.sac.tau": config.agent.sac.tau,

@@ -71,6 +71,11 @@ class Layout:
         )
 
     @property
+    def sizes(self) -> tuple[int, int, int]:
+        """Of observation, goal and action."""
+        return self.observation_dim, self.goal_dim, self.action_dim
+
+    @property
     def places_dim(self) -> int:
         """How many components of a goal, from the first on, count in its distance."""
         return self.goal_dim - self.latent_dim

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from eisp_data.config import load_yaml
 from eisp_data.errors import DataError
-from eisp_data.runs.episodes import rows_of, split
+from eisp_data.runs.episodes import hold_out, rows_of
 from eisp_data.runs.folder import begin_run, check_same_dataset, has_progress
 from eisp_data.runs.metrics import MetricsLog
 from eisp_data.storage.cache import DatasetArrays
@@ -141,9 +141,7 @@ def load_trajectories(
     """Read the dataset into memory, split by episode into what is learned from and held out."""
     arrays = load_seen(config.dataset.root, config.agent, vision)
     layout = layout_of(arrays, 0 if vision is None else vision.latent_dim)
-    held, rest = split(arrays.num_episodes, config.validation_share, config.seed)
-    if not len(rest):
-        raise DataError(f"{config.dataset.root} has too few episodes: {arrays.num_episodes}")
+    held, rest = hold_out(config.dataset.root, arrays, config.validation_share, config.seed)
     parts = config.agent.waypoints
     held_out = gather(arrays, held, layout, parts)
     train = gather(arrays, rest, layout, parts)
@@ -167,8 +165,7 @@ def layout_of(arrays: DatasetArrays, latent_dim: int = 0) -> Layout:
         return Layout.of(TASKS[state_task(spec.task)]).seen(latent_dim)
     plain = Layout(spec.observation_dim, spec.goal_dim, spec.action_dim)
     known = Layout.of(TASKS[spec.task]) if spec.task in TASKS else plain
-    sizes = known.observation_dim, known.goal_dim, known.action_dim
-    return known if sizes == (spec.observation_dim, spec.goal_dim, spec.action_dim) else plain
+    return known if known.sizes == plain.sizes else plain
 
 
 def gather(

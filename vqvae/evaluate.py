@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from eisp_data.config import load_yaml
-from eisp_data.errors import ConfigError, DataError
-from eisp_data.runs.episodes import rows_of, split
+from eisp_data.errors import ConfigError
+from eisp_data.runs.episodes import hold_out, rows_of
 from eisp_data.runs.folder import folders_of_run
 from eisp_data.sim.pixels import Pixels
 from eisp_data.storage.cache import load_arrays, load_images
@@ -77,9 +77,7 @@ def evaluate(path: Path, root: Path | None = None) -> VqVaeEvaluation:
     root = root or trained.dataset.root
     arrays = load_arrays(root)
     check_task(root, arrays, vision)
-    held, rest = split(arrays.num_episodes, trained.validation_share, trained.seed)
-    if not len(rest):
-        raise DataError(f"{root} has too few episodes: {arrays.num_episodes}")
+    held, rest = hold_out(root, arrays, trained.validation_share, trained.seed)
     codes = load_codes(root, model, vision.camera)
     seen = see(model, codes)
     places, latents = seen[:, : model.places], seen[:, model.places :]

@@ -17,7 +17,7 @@ from eisp_data.config import above_zero, at_least, check_seed, load_yaml
 from eisp_data.errors import ConfigError, DataError
 from eisp_data.runs import MODEL, checkpoint
 from eisp_data.runs.device import choose_device
-from eisp_data.runs.episodes import rows_of, split
+from eisp_data.runs.episodes import hold_out, rows_of
 from eisp_data.runs.folder import begin_run, check_same_dataset, has_progress
 from eisp_data.runs.memory import keep_freed_memory
 from eisp_data.runs.metrics import MetricsLog
@@ -157,8 +157,7 @@ def check(config: VqVaeTrainConfig) -> None:
     above_zero({"--lr": config.lr})
     if model.codes > _MOST_CODES:
         raise ConfigError(f"--model.codes must be at most {_MOST_CODES}; got {model.codes}")
-    if not model.reading >= 0:
-        raise ConfigError(f"--model.reading must be at least 0; got {model.reading}")
+    at_least(0, {"--model.reading": model.reading})
     for flag, share in (
         ("--validation-share", config.validation_share),
         ("--model.decay", model.decay),
@@ -182,9 +181,7 @@ def load_frames(
     root, camera = config.dataset.root, config.dataset.camera
     check_images(root, camera, config.model.image_size)
     images, arrays = load_images(root, camera), load_arrays(root)
-    held, rest = split(arrays.num_episodes, config.validation_share, config.seed)
-    if not len(rest):
-        raise DataError(f"{root} has too few episodes: {arrays.num_episodes}")
+    held, rest = hold_out(root, arrays, config.validation_share, config.seed)
     return images, arrays, rest, held
 
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
+from eisp_data.errors import DataError
 from eisp_data.storage.cache import DatasetArrays
 
 _GOLDEN_RATIO = (5.0**0.5 - 1.0) / 2.0
@@ -26,3 +29,13 @@ def split(episodes: int, share: float, seed: int) -> tuple[np.ndarray, np.ndarra
     place = (np.random.default_rng(seed).random() + _GOLDEN_RATIO * np.arange(episodes)) % 1.0
     held = place < max(share, place.min() + _ROUNDING)
     return np.flatnonzero(held), np.flatnonzero(~held)
+
+
+def hold_out(
+    root: Path, arrays: DatasetArrays, share: float, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``split`` of a dataset; DataError if nothing is left to learn from."""
+    held, rest = split(arrays.num_episodes, share, seed)
+    if not len(rest):
+        raise DataError(f"{root} has too few episodes: {arrays.num_episodes}")
+    return held, rest
