@@ -41,6 +41,7 @@ class OnlineConfig:
     evaluate_every: int = 10
     """Rounds between evaluations, each followed by a checkpoint."""
     evaluation_episodes: int = 100
+    """A policy that looks best in them has to show it in three times as many more."""
 
 
 @dataclass(frozen=True)

@@ -35,10 +35,10 @@ def _command(config: FinetuneConfig) -> None:
     steps = summary["recovery_steps"]
     recovery = f"recovered after {steps:.0f} steps" if math.isfinite(steps) else "not recovered"
     print(
-        f"success before {summary['offline_success']:.2f}, best {summary['best_success']:.2f}; "
+        f"success before {summary['offline_success']:.2f}; "
         f"deepest dip {summary['dip']:.2f}, {recovery}"
     )
-    print(f"policy: {config.output_dir / 'best'}")
+    print(f"policy: {config.output_dir / 'best'}, success {summary['best_success']:.3f}")
 
 
 def _start(words: list[str]) -> FinetuneConfig | None:

@@ -184,16 +184,20 @@ def test_a_generator_may_be_left_as_it_is(pretrained, tmp_path):
     assert all(torch.equal(before[name], after[name]) for name in names)
 
 
-def test_the_policy_of_the_best_evaluation_is_kept(pretrained, tmp_path, monkeypatch):
-    said, real = iter([0.2, 0.9, 0.4]), finetune_train.evaluate
+def test_the_policy_that_is_best_on_all_episodes_is_kept(pretrained, tmp_path, monkeypatch):
+    # Each that looks best is tried again: the last one was lucky.
+    said, asked, real = iter([0.2, 0.2, 0.8, 0.9, 1.0, 0.8]), [], finetune_train.evaluate
 
     def evaluate(*args: object, **options: object) -> Evaluation:
+        asked.append((args[3] - finetune_train._SELECTION_SEED, args[2]))  # type: ignore[operator]
         result = real(*args, **options)  # type: ignore[arg-type]
         return replace(result, success_last=replace(result.success_last, mean=next(said)))
 
     monkeypatch.setattr(finetune_train, "evaluate", evaluate)
     summary = finetune(tiny_finetuning(pretrained, tmp_path))
-    assert (summary["offline_success"], summary["best_success"]) == (0.2, 0.9)
+    assert asked == [(0, 1), (1, 3)] * 3
+    assert summary["offline_success"] == 0.2
+    assert summary["best_success"] == pytest.approx(0.875)
     best, second, last = (
         load_file(tmp_path / name / "pretrained_model/model.safetensors")
         for name in ("best", "checkpoints/000001", "checkpoints/last")
@@ -390,6 +394,5 @@ def curve(*success: float) -> list[dict[str, float]]:
 def test_the_summary_tells_the_dip_and_the_steps_to_recover(success, dip, recovery_steps):
     summary = summarise(curve(*success))
     assert summary["offline_success"] == success[0]
-    assert summary["best_success"] == max(success)
     assert summary["dip"] == pytest.approx(dip)
     assert summary["recovery_steps"] == pytest.approx(recovery_steps, nan_ok=True)
