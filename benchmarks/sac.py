@@ -1,6 +1,7 @@
 """How fast SAC with hindsight goals learns, against Stable-Baselines3 and SBX, in one run.
 
     python benchmarks/sac.py                  # prints a table of rates and their ratios
+    pip install sbx-rl                        # before it, for SBX, which brings JAX
 
 One update is sampling with goals relabelled in hindsight, both critics, the actor and the target,
 on episodes of Stack's shapes. Ours is plain SAC as in ``--preset paper``: no layer norm, no
