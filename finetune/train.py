@@ -34,11 +34,11 @@ from pretrain.saved import POLICY
 
 _SELECTION_SEED = 500_000_000
 """Seeds from here on choose among checkpoints; none of them is ever reported on."""
+_TRAINING_SEED = 1_000_000_000
+"""Seeds from here on are the worlds that are learned in."""
 _CONFIRMING = 3
 """A policy that looks best is tried on so many times the episodes of an evaluation more: the best
 of many evaluations has been lucky, too."""
-_TRAINING_SEED = 1_000_000_000
-"""Seeds from here on are the worlds that are learned in."""
 
 _OF_POLICY = "subgoal", "age", "start", "stuck", "met", "idle", "failed"
 """What a ``SubgoalPolicy`` has to remember."""
