@@ -1,4 +1,4 @@
-"""What the tests of learning share: a small dataset of Stack, and a policy pretrained on it."""
+"""What the tests share, from the precision of products to a small pretrained policy."""
 
 from __future__ import annotations
 
@@ -7,6 +7,15 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import torch
+
+
+@pytest.fixture(autouse=True)
+def fp32_products() -> Iterator[None]:
+    """Undo what a run allows, before and after: it sets the precision for the whole process."""
+    torch.backends.mkldnn.matmul.fp32_precision = "ieee"
+    yield
+    torch.backends.mkldnn.matmul.fp32_precision = "ieee"
 
 
 @pytest.fixture
