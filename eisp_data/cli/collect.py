@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -72,6 +73,7 @@ def collect(config: CollectConfig) -> None:
     from tqdm import tqdm
 
     from eisp_data.config import save_yaml, to_plain
+    from eisp_data.storage.episodes import read_seeds
     from eisp_data.storage.lerobot import DatasetWriter
 
     source = _EnvSource(config) if config.env.id else _TaskSource(config)
@@ -83,7 +85,7 @@ def collect(config: CollectConfig) -> None:
     except OSError as error:
         raise ConfigError(f"cannot write to {config.output_dir}: {error.strerror}") from None
     with writer:
-        seeds = episode_seeds(config.seed, writer.num_episodes, config.episodes)
+        seeds = missing_seeds(config.seed, read_seeds(config.output_dir), config.episodes)
         if seeds:
             done = writer.num_episodes
             with tqdm(desc="collecting", total=config.episodes, initial=done, unit="ep") as bar:
@@ -98,6 +100,16 @@ def episode_seeds(seed: int, start: int, stop: int) -> range:
     """
     first = (seed + 1) * _SEEDS_APART
     return range(first + start, first + stop)
+
+
+def missing_seeds(seed: int, present: Sequence[int], episodes: int) -> list[int]:
+    """Return the first seeds that a dataset lacks, as many as bring it to ``episodes``.
+
+    Seeds 0, 1, 4 and 5 present and 7 episodes wanted: 2, 3 and 6.
+    """
+    here = set(present)
+    lacking = (s for s in episode_seeds(seed, 0, _SEEDS_APART) if s not in here)
+    return list(islice(lacking, max(0, episodes - len(present))))
 
 
 def _check(config: CollectConfig) -> None:
@@ -142,7 +154,7 @@ class _TaskSource:
             self._noise = Noise() if oracle else DEMONSTRATOR[self._task.name]
             self.recipe["noise"] = asdict(self._noise)
 
-    def episodes(self, seeds: range) -> Iterator[Episode]:
+    def episodes(self, seeds: Sequence[int]) -> Iterator[Episode]:
         if not self.spec.cameras:
             yield from self._states(seeds)
             return
@@ -153,7 +165,7 @@ class _TaskSource:
             for episode in self._states(seeds):
                 yield replace(episode, images={camera: pixels.draw(episode.sim_state)})
 
-    def _states(self, seeds: range) -> Iterator[Episode]:
+    def _states(self, seeds: Sequence[int]) -> Iterator[Episode]:
         from eisp_data import collect
         from eisp_data.sim.worlds import Worlds
 
@@ -204,7 +216,7 @@ class _EnvSource:
             action_dim=worlds.action_dim,
         )
 
-    def episodes(self, seeds: range) -> Iterator[Episode]:
+    def episodes(self, seeds: Sequence[int]) -> Iterator[Episode]:
         from eisp_data.collect import explore
 
         return explore(self._worlds, seeds)

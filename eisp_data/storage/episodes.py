@@ -137,6 +137,15 @@ def _integers(table: pa.Table, name: str, path: Path) -> np.ndarray:
         raise DataError(f"{path}: column {name} is missing or does not hold integers") from None
 
 
+def read_seeds(root: Path) -> list[int]:
+    """Return the seed of each episode of a dataset, in order."""
+    return [
+        int(seed)
+        for path in read_index(root).tables
+        for seed in _integers(read_parquet(path, ["seed"]), "seed", path)
+    ]
+
+
 def episode_row(
     spec: DatasetSpec,
     *,
@@ -152,7 +161,7 @@ def episode_row(
     """Return an episode's row of ``meta/episodes`` without its statistics.
 
     Beside LeRobot's pointers it has what one filters episodes by: success at the last
-    observation, return, seed, policy, operator and noise.
+    observation, return, seed, policy and operator.
 
     Args:
         spec: the dataset's.
@@ -166,7 +175,6 @@ def episode_row(
         info: of the episode.
     """
     chunk, file = position(data_file)
-    noise = info.get("noise")
     row: dict[str, Any] = {
         "episode_index": episode,
         "tasks": [spec.instruction],
@@ -180,7 +188,6 @@ def episode_row(
         "seed": int(seed),
         "policy": str(info.get("policy", "")),
         "operator": str(info.get("operator", "")),
-        "noise": float(noise) if isinstance(noise, int | float) else float("nan"),
     }
     for camera, (number, frame) in video.items():
         key = f"videos/{video_key(camera)}"

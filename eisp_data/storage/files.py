@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import math
@@ -145,10 +146,15 @@ class WriterLock:
             fcntl.lockf(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             # The owner before may have removed the file between our open and our lock.
             if os.fstat(self._descriptor).st_nlink == 0:
-                raise BlockingIOError
-        except OSError:
+                raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+        except OSError as error:
             owner = os.read(self._descriptor, 32).decode(errors="replace").strip()
             os.close(self._descriptor)
+            if error.errno not in (errno.EAGAIN, errno.EACCES):
+                raise DataError(
+                    f"{folder}: cannot be locked against a second writer "
+                    f"({error.strerror or error}); write to another filesystem"
+                ) from None
             raise DataError(
                 f"{folder}: process {owner or 'unknown'} is writing this dataset; "
                 "wait for it to end or write elsewhere"

@@ -115,7 +115,9 @@ def compact_episodes(root: Path) -> None:
         return
     first = episodes_path(root, 0)
     if list(index.tables) != [first]:
-        table = pa.concat_tables([read_parquet(path) for path in index.tables])
+        # By name: a rewrite orders the columns otherwise, and earlier versions had one more.
+        tables = [read_parquet(path) for path in index.tables]
+        table = pa.concat_tables(tables, promote_options="default")
         zeros = pa.array(np.zeros(table.num_rows, dtype=np.int64))
         for name in ("meta/episodes/chunk_index", "meta/episodes/file_index"):
             table = table.set_column(table.column_names.index(name), name, zeros)

@@ -68,24 +68,24 @@ def _shared(root: Path) -> tuple[DatasetSpec, dict[str, Any]]:
             return DatasetSpec.from_json(stored["spec"]), dict(stored["recipe"])
         except (KeyError, TypeError, ValueError):
             raise DataError(f"{path}: spec or recipe is missing") from None
-    sidecars = read_sidecars(root, read_index(root))
-    if not sidecars:
-        raise DataError(f"{root}: holds no episodes")
+    spec: DatasetSpec | None = None
     recipes: list[dict[str, Any]] = []
-    for sidecar in sidecars:
+    for sidecar in read_sidecars(root):
+        spec = spec or sidecar.spec
         recipes += [] if sidecar.recipe in recipes else [sidecar.recipe]
-    return sidecars[0].spec, recipes[0] if len(recipes) == 1 else {"merged": recipes}
+    if spec is None:
+        raise DataError(f"{root}: holds no episodes")
+    return spec, recipes[0] if len(recipes) == 1 else {"merged": recipes}
 
 
-def read_sidecars(root: Path, index: EpisodeIndex) -> list[Sidecar]:
-    """Return the sidecar of every episode, without reading any other column."""
-    texts: list[Sidecar] = []
+def read_sidecars(root: Path) -> Iterator[Sidecar]:
+    """Yield the sidecar of every episode, without reading any other column."""
+    index = read_index(root)
     for first, stop in runs(index):
         path = index.data_path(first)
         table = read_rows(path, [SIDECAR_COLUMN, "episode_index"])
         starts = _starts(table, path, index, first, stop)
-        texts += _sidecars(table, path, starts, first)
-    return texts
+        yield from _sidecars(table, path, starts, first)
 
 
 def read_blocks(root: Path, spec: DatasetSpec, finite: bool = True) -> Iterator[Block]:

@@ -60,7 +60,7 @@ class _Found:
 
 def repaired_path(root: Path) -> Path:
     """Return where ``repair`` puts its copy unless it is told."""
-    return root.with_name(f"{root.name}.repaired")
+    return root.parent / f"{root.name}.repaired"
 
 
 def repair(root: Path | str, to: Path | None = None, in_place: bool = False) -> RepairReport:
@@ -77,9 +77,11 @@ def repair(root: Path | str, to: Path | None = None, in_place: bool = False) -> 
             a folder to be made is there already.
     """
     root = Path(root)
+    if root.name in ("", ".."):  # what is made beside it is called after it
+        root = root.resolve()
     if not (root / "data").is_dir():
         raise DataError(f"{root}: not a LeRobot dataset, the folder data is missing")
-    copy, damaged = to or repaired_path(root), root.with_name(f"{root.name}.damaged")
+    copy, damaged = to or repaired_path(root), root.parent / f"{root.name}.damaged"
     if in_place and damaged.exists():
         raise DataError(f"{damaged}: exists already; move it away first")
     lock = WriterLock(root) if os.access(root, os.W_OK) else None

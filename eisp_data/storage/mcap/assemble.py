@@ -5,6 +5,7 @@ Row k holds what was known at its time (see ``timeline``) and the command neares
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -43,6 +44,11 @@ class Rate:
     """Whose times count: the sensors' or the recorder's."""
 
 
+ORIGIN = ("source_file", "source_episode", "start_ns")
+"""What an episode's info says of where it is from; files in different folders may share a name."""
+Origin = tuple[Scalar | None, ...]
+
+
 @dataclass
 class Made:
     """One episode with its further columns, and what there is to say of it."""
@@ -71,8 +77,8 @@ class Assembler:
             for reason, n in source.left_out.items()
         ]
 
-    def episodes(self, skip: int = 0) -> Iterator[Made | None]:
-        """Yield each episode in turn, None for the first ``skip``, whose images are not read."""
+    def episodes(self, done: Counter[Origin]) -> Iterator[Made]:
+        """Yield each episode in turn but those of ``done``, which are taken out of it."""
         number = 0
         period_ns = round(NANOSECONDS / self.rate.rate_hz)
         for window in timeline.windows(self.recording):
@@ -87,7 +93,11 @@ class Assembler:
                 self._say(window, "no row has all sources; left out")
             for ticks in stretches:
                 ended = window.outcome == "success" and bool(ticks[-1] == rows.ticks[-1])
-                yield None if number < skip else self._make(window, rows, ticks, number, ended)
+                here = (self._file, number, int(ticks[0]))
+                if done[here]:
+                    done[here] -= 1
+                else:
+                    yield self._make(window, rows, ticks, number, ended)
                 number += 1
 
     def _say(self, window: Window, text: str) -> None:

@@ -12,8 +12,9 @@ import numpy as np
 from eisp_data.errors import DataError
 from eisp_data.storage.checks import Check
 from eisp_data.storage.mcap import decode, pixels
-from eisp_data.storage.mcap.reader import ChannelStats, Entry, McapLog
+from eisp_data.storage.mcap.reader import Entry, McapLog
 from eisp_data.storage.mcap.resample import longest_usual_gap_ns
+from eisp_data.storage.mcap.tally import Tally
 from eisp_data.storage.mcap.windows import cut
 
 STUCK_MESSAGES = 50
@@ -28,7 +29,6 @@ SUSPICIOUS = ("hardware times", "no gaps", "not stuck")
 class _Seen:
     """What was seen of one channel."""
 
-    stats: ChannelStats = field(default_factory=ChannelStats)
     times: array = field(default_factory=lambda: array("d"))
     """Log times in seconds."""
     backwards: int = 0
@@ -52,12 +52,14 @@ def checks(path: str | Path) -> list[Check]:
         seen: dict[str, _Seen] = {topic: _Seen() for topic in sorted(log.topics)}
         events: list[decode.Event] = []
         decoder = decode.Decoder()
+        tally = Tally(log.topics, log.header()[1])
         for entry in log.messages(in_order=False):
+            tally.add(entry.topic, entry.message)
             _look(log, decoder, entry, seen[entry.topic], events)
         return [
             _whole(log),
             _counts(log, seen),
-            *_channels(seen),
+            *_channels(seen, tally),
             _images(seen),
             _episodes(events, seen),
         ]
@@ -70,7 +72,6 @@ def _look(
     at = message.log_time_ns / 1e9
     seen.backwards += bool(seen.times) and at < seen.times[-1]
     seen.times.append(at)
-    seen.stats.add(message)
     lag = abs(message.log_time_ns - message.publish_time_ns) / 1e9
     seen.largest_lag_s = max(seen.largest_lag_s, lag)
     schema = log.schema_of(entry.channel)
@@ -116,19 +117,17 @@ def _whole(log: McapLog) -> Check:
 
 
 def _counts(log: McapLog, seen: dict[str, _Seen]) -> Check:
-    read = sum(s.stats.count for s in seen.values())
+    read = sum(len(s.times) for s in seen.values())
     if log.statistics is None:
         return Check("message count", not log.layout.ended, f"{read} read; none stated")
     stated = log.statistics.message_count
     return Check("message count", read == stated, f"{read} read, {stated} stated")
 
 
-def _channels(seen: dict[str, _Seen]) -> Iterator[Check]:
+def _channels(seen: dict[str, _Seen], tally: Tally) -> Iterator[Check]:
     """Yield the checks that look at each channel and name those that fail."""
     by_channel = {
-        "nothing dropped": {
-            t: f"{s.stats.missing} missing" for t, s in seen.items() if s.stats.missing
-        },
+        "nothing dropped": {t: f"{n} missing" for t, n in sorted(tally.missing().items())},
         "log times rise": {t: f"{s.backwards} steps back" for t, s in seen.items() if s.backwards},
         "hardware times": {
             t: f"up to {s.largest_lag_s:.3g} s off log time"
@@ -143,9 +142,9 @@ def _channels(seen: dict[str, _Seen]) -> Iterator[Check]:
             if s.not_finite
         },
         "not stuck": {
-            t: f"{s.stats.count} times the same reading"
+            t: f"{len(s.times)} times the same reading"
             for t, s in seen.items()
-            if s.reading and not s.changed and s.stats.count >= STUCK_MESSAGES
+            if s.reading and not s.changed and len(s.times) >= STUCK_MESSAGES
         },
     }
     for name, failed in by_channel.items():

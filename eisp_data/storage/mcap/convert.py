@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 
 from eisp_data.errors import ConfigError, DataError
 from eisp_data.storage.lerobot import DatasetSpec, DatasetWriter
-from eisp_data.storage.mcap.assemble import Assembler, Made, Rate
+from eisp_data.storage.mcap.assemble import ORIGIN, Assembler, Made, Origin, Rate
 from eisp_data.storage.mcap.build import GOAL, REACHED, STATE, WORLD
 from eisp_data.storage.mcap.collect import Clock
 from eisp_data.storage.mcap.columns import age_columns, extra_widths
@@ -18,6 +19,7 @@ from eisp_data.storage.mcap.guess import guess_mapping
 from eisp_data.storage.mcap.mapping import Mapping, load_mapping
 from eisp_data.storage.mcap.reader import McapLog
 from eisp_data.storage.mcap.sources import Recording, load
+from eisp_data.storage.reader import read_sidecars
 
 _BATCH_BYTES = 64 * 2**20
 _BATCH_EPISODES = 100
@@ -114,7 +116,10 @@ def convert(
     recipe = _recipe(config, mapping, first, paths)
     with DatasetWriter(config.to, spec, recipe, resume=config.resume) as writer:
         before = writer.num_episodes
-        made = _made(paths, first, mapping, rate, spec.task, before, report)
+        done: Counter[Origin] = Counter(
+            tuple(sidecar.info.get(name) for name in ORIGIN) for sidecar in read_sidecars(config.to)
+        )
+        made = _made(paths, first, mapping, rate, spec.task, done, report)
         for batch in _batches(made):
             writer.write([m.episode for m in batch], [m.extras for m in batch])
             for m in batch:
@@ -139,20 +144,16 @@ def _made(
     mapping: Mapping,
     rate: Rate,
     task: str,
-    skip: int,
+    done: Counter[Origin],
     report: ConvertReport,
 ) -> Iterator[Made]:
-    """Yield the episodes of all files but the first ``skip``; ``first`` is of the first file."""
+    """Yield the episodes of all files but those of ``done``; ``first`` is of the first file."""
     for number, path in enumerate(paths):
         with McapLog(path) as log:
             recording = load(log, mapping, rate.clock) if number else first
             assembler = Assembler(log, recording, rate, task)
             report.lines += [f"{path.name}: {problem}" for problem in recording.problems]
-            for made in assembler.episodes(skip):
-                if made is None:
-                    skip -= 1
-                else:
-                    yield made
+            yield from assembler.episodes(done)
             report.lines += assembler.lines
 
 

@@ -7,7 +7,6 @@ import heapq
 import io
 import struct
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,6 +19,7 @@ from eisp_data.errors import DataError
 from eisp_data.storage.mcap import records, scan
 from eisp_data.storage.mcap.records import BadRecord, Message
 from eisp_data.storage.mcap.scan import Segment
+from eisp_data.storage.mcap.tally import ChannelStats, Tally
 
 _HEADER_BYTES = 2**16
 MAX_BUFFER_BYTES = 512 * 2**20
@@ -32,29 +32,6 @@ class Entry(NamedTuple):
     topic: str
     channel: Channel
     message: Message
-
-
-@dataclass
-class ChannelStats:
-    """What a full pass counted on one channel."""
-
-    count: int = 0
-    first_ns: int = 0
-    last_ns: int = 0
-    missing: int = 0
-    """Messages that the sequence numbers show to be absent: dropped or lost."""
-    _last_sequence: int | None = field(default=None, repr=False)
-
-    def add(self, message: Message) -> None:
-        """Count one message; calls come in the order of recording."""
-        self.first_ns = message.log_time_ns if self.count == 0 else self.first_ns
-        self.last_ns = max(self.last_ns, message.log_time_ns)
-        self.count += 1
-        last = self._last_sequence
-        # Many writers leave the sequence at 0; only a rising one says anything.
-        if last is not None and message.sequence > last:
-            self.missing += message.sequence - last - 1
-        self._last_sequence = message.sequence
 
 
 class McapLog:
@@ -164,10 +141,10 @@ class McapLog:
 
     def stats(self) -> dict[str, ChannelStats]:
         """Read the whole file once and count the messages of each topic."""
-        found = {channel.topic: ChannelStats() for channel in self.channels.values()}
+        tally = Tally(self.topics, self.header()[1])
         for entry in self.messages(in_order=False):
-            found[entry.topic].add(entry.message)
-        return found
+            tally.add(entry.topic, entry.message)
+        return tally.channels
 
     def extras(self) -> Iterator[tuple[int, bytes]]:
         """Yield (opcode, body) of each attachment and metadata record."""

@@ -16,7 +16,8 @@ from mcap.records import Attachment, Metadata
 from mcap.writer import CompressionType, Writer
 
 from eisp_data.errors import DataError
-from eisp_data.storage.mcap.reader import ChannelStats, McapLog
+from eisp_data.storage.mcap.reader import McapLog
+from eisp_data.storage.mcap.tally import Tally
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class RepairReport:
         """Return the report as lines of text."""
         kept = f"kept {self.messages} messages over {self.duration_s:.2f} s in {self.copy}"
         lost = [f"lost {self.lost_bytes} bytes of {self.source}"] if self.lost_bytes else []
-        gaps = [f"{topic}: {n} messages are missing" for topic, n in self.missing.items() if n]
+        gaps = [f"{topic}: {n} messages are missing" for topic, n in self.missing.items()]
         return [kept, *lost, *gaps, *(f"found: {problem}" for problem in self.problems)]
 
 
@@ -63,8 +64,8 @@ def repair(source: str | Path, copy: str | Path | None = None) -> RepairReport:
     partial = copy.with_name(copy.name + ".partial")
     try:
         with McapLog(source) as log, partial.open("wb") as file:
-            stats = _copy(log, file)
-            read = [s for s in stats.values() if s.count]
+            tally = _copy(log, file)
+            read = [s for s in tally.channels.values() if s.count]
             if not read:
                 raise DataError(f"{source}: no message in it can be read; nothing to repair")
             file.flush()
@@ -76,7 +77,7 @@ def repair(source: str | Path, copy: str | Path | None = None) -> RepairReport:
                 messages=sum(s.count for s in read),
                 duration_s=(last - first) / 1e9,
                 lost_bytes=log.lost_bytes,
-                missing={topic: s.missing for topic, s in stats.items() if s.missing},
+                missing=tally.missing(),
                 problems=log.problems,
             )
         os.replace(partial, copy)
@@ -87,22 +88,22 @@ def repair(source: str | Path, copy: str | Path | None = None) -> RepairReport:
     return report
 
 
-def _copy(log: McapLog, file: IO[bytes]) -> dict[str, ChannelStats]:
-    """Write the readable part of ``log`` and return what was counted by topic."""
+def _copy(log: McapLog, file: IO[bytes]) -> Tally:
+    """Write the readable part of ``log`` and return what was counted."""
     writer = Writer(file, compression=CompressionType.ZSTD)
     profile, library = log.header()
     writer.start(profile=profile, library=library)
     for opcode, body in log.extras():
         _copy_extra(writer, opcode, body, log)
     channels = _define(log, writer)
-    stats = {topic: ChannelStats() for topic in log.topics}
+    tally = Tally(log.topics, library)
     for topic, _, m in log.messages(in_order=False):
         writer.add_message(
             channels[m.channel_id], m.log_time_ns, m.data, m.publish_time_ns, m.sequence
         )
-        stats[topic].add(m)
+        tally.add(topic, m)
     writer.finish()
-    return stats
+    return tally
 
 
 def _define(log: McapLog, writer: Writer) -> dict[int, int]:

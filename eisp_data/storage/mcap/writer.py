@@ -25,6 +25,7 @@ from eisp_data.errors import ConfigError, DataError
 from eisp_data.storage.mcap import messages
 from eisp_data.storage.mcap.backlog import Backlog, Item
 from eisp_data.storage.mcap.mapping import check_role
+from eisp_data.storage.mcap.tally import LIBRARY
 
 COMPRESSIONS = {
     "zstd": CompressionType.ZSTD,
@@ -249,7 +250,7 @@ class McapWriter:
 
     def _run(self) -> None:
         try:
-            self._writer.start(profile="", library="eisp-data")
+            self._writer.start(profile="", library=LIBRARY)
             if self._session:
                 self._writer.add_metadata("session", self._session)
             self._flush()

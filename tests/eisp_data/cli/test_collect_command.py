@@ -7,10 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from eisp_data.cli.collect import CONFIG_FILE, CollectConfig, EnvConfig, collect, episode_seeds
+from eisp_data.cli.collect import (
+    CONFIG_FILE,
+    CollectConfig,
+    EnvConfig,
+    collect,
+    episode_seeds,
+    missing_seeds,
+)
 from eisp_data.cli.parse import parse
 from eisp_data.errors import ConfigError
+from eisp_data.storage.episodes import read_index
 from eisp_data.storage.lerobot import read_episodes, read_recipe, read_spec
+from eisp_data.storage.merge import merge
+from eisp_data.storage.rewrite import Source, rewrite
+from eisp_data.storage.validate import validate
 
 ARRAYS = (
     "observation", "achieved_goal", "desired_goal", "action", "reward",
@@ -47,6 +58,37 @@ def test_a_resumed_dataset_is_the_one_that_was_never_interrupted(stack, tmp_path
     assert_same(stack.output_dir, tmp_path / "data")
     assert not configured_again(tmp_path / "data", tmp_path / "other").resume
     assert "4 episodes" in capsys.readouterr().out
+
+
+def test_resume_collects_what_a_repair_had_lost_and_no_episode_twice(stack, tmp_path):
+    less, root = tmp_path / "less", tmp_path / "data"
+    kept = Source(read_index(stack.output_dir), [0, 3])
+    rewrite([kept], less, read_spec(stack.output_dir), read_recipe(stack.output_dir))
+    merge([less], root)
+    collect(replace(stack, output_dir=root, resume=True))
+    assert [episode.seed - 2_000_000 for episode in read_episodes(root)] == [0, 3, 1, 2]
+    by_seed = {episode.seed: episode for episode in read_episodes(root)}
+    for one in read_episodes(stack.output_dir):
+        for name in ARRAYS:
+            assert np.array_equal(getattr(one, name), getattr(by_seed[one.seed], name)), name
+    assert [path.name for path in root.glob("meta/episodes/*/*")] == ["file-000.parquet"]
+    assert all(check.passed for check in validate(root))
+
+
+@pytest.mark.parametrize(
+    ("present", "episodes", "lacking"),
+    [
+        ([], 3, [0, 1, 2]),
+        ([0, 1], 4, [2, 3]),
+        ([0, 1, 4, 5], 6, [2, 3]),
+        ([0, 1, 4, 5], 7, [2, 3, 6]),
+        ([0, 1, 4, 5], 3, []),
+        ([0, 1, 0, 1], 5, [2]),
+    ],
+)
+def test_the_seeds_to_come_are_the_first_that_are_not_there(present, episodes, lacking):
+    first = episode_seeds(7, 0, 1).start
+    assert missing_seeds(7, [first + n for n in present], episodes) == [first + n for n in lacking]
 
 
 def configured_again(dataset, to):

@@ -189,6 +189,16 @@ def test_in_place_keeps_the_original_under_another_name(make_dataset):
     assert after == before
 
 
+@pytest.mark.parametrize(("here", "path"), [("dataset", "."), ("dataset/data", "..")])
+def test_a_dataset_is_repaired_from_within(make_dataset, monkeypatch, here, path):
+    root, _ = make_dataset()
+    monkeypatch.chdir(root.parent / here)
+    report = repair(path)
+    assert report.copy == root.with_name("dataset.repaired") and failed(report.copy) == set()
+    assert repair(path, to=root.with_name("again"), in_place=True).copy == root
+    assert root.with_name("dataset.damaged").is_dir()
+
+
 def test_a_stuck_channel_and_a_late_action_are_pointed_out(tmp_path):
     spec = spec_of(action_dim=2)
     rng = np.random.default_rng(0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import json
 import os
 import subprocess
@@ -11,7 +13,8 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from eisp_data.storage.files import make_partial, replace_atomically, write_json
+from eisp_data.errors import DataError
+from eisp_data.storage.files import WriterLock, make_partial, replace_atomically, write_json
 
 
 def refuse(text: str) -> float:
@@ -63,3 +66,23 @@ os.kill(os.getpid(), 9)
     assert len(left) == 1
     assert set(tmp_path.iterdir()) == {ours, beside} | left
     os.rename(ours, tmp_path / "wanted")
+
+
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        (errno.ENOLCK, "cannot be locked against a second writer (No locks available)"),
+        (errno.EOPNOTSUPP, "cannot be locked against a second writer (Operation not supported)"),
+        (errno.EACCES, "process unknown is writing this dataset"),
+    ],
+)
+def test_a_disk_without_locks_is_not_taken_for_a_second_writer(tmp_path, monkeypatch, code, said):
+    def refuse(*_words):
+        raise OSError(code, os.strerror(code))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(fcntl, "lockf", refuse)
+        with pytest.raises(DataError) as caught:
+            WriterLock(tmp_path)
+    assert said in str(caught.value)
+    WriterLock(tmp_path).release()

@@ -6,11 +6,13 @@ import json
 import sys
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
-from storage_samples import assert_same, spec_of
+from storage_samples import assert_same, random_episode, spec_of
 
 from eisp_data.storage.cache import load_arrays
-from eisp_data.storage.lerobot import read_episodes, read_recipe, read_spec
+from eisp_data.storage.lerobot import DatasetWriter, read_episodes, read_recipe, read_spec
 
 
 @pytest.fixture(autouse=True)
@@ -64,6 +66,21 @@ def test_it_opens_and_info_counts_what_was_written(make_dataset, edit, capsys):
     edit(**{"repo_id": "test/dataset", "root": root, "operation.type": "info"})
     said = capsys.readouterr().out
     assert "Total episode: 5" in said and "Actual Count): 40(40)" in said
+
+
+def test_it_opens_what_an_earlier_version_began_and_this_one_goes_on_with(make_dataset):
+    """Then ``meta/episodes`` had a column more; while a batch is new, its files differ."""
+    root, episodes = make_dataset()
+    first = root / "meta/episodes/chunk-000/file-000.parquet"
+    table = pq.read_table(first)
+    after = table.column_names.index("operator") + 1
+    pq.write_table(table.add_column(after, "noise", pa.array([np.nan] * 5)), first)
+    more = [random_episode(spec_of(), 7, 50)]
+    with DatasetWriter(root, spec_of(), {"policy": "script", "seed": 0}, resume=True) as writer:
+        writer.write(more)
+        check(root, [*episodes, *more])
+    assert not first.with_name("file-001.parquet").exists()
+    check(root, [*episodes, *more])
 
 
 def test_episodes_are_filtered_by_what_we_say_of_them(make_dataset):

@@ -17,6 +17,8 @@ from storage_samples import assert_same, random_episode, spec_of
 from eisp_data.episode import Episode
 from eisp_data.errors import DataError
 from eisp_data.storage.lerobot import DatasetWriter, read_episodes, read_recipe, read_spec
+from eisp_data.storage.merge import merge
+from eisp_data.storage.repair import repair
 from eisp_data.storage.validate import validate
 
 
@@ -101,6 +103,22 @@ def test_resume_goes_on_after_the_last_batch(make_dataset):
         writer.write(more)
     for ours, theirs in zip([*episodes, *more], read_episodes(root), strict=True):
         assert_same(ours, theirs)
+
+
+@pytest.mark.parametrize("copy", [lambda root, to: merge([root], to), repair])
+def test_what_was_merged_or_repaired_is_resumed_and_tidied_up(make_dataset, tmp_path, copy):
+    root, episodes = make_dataset(cameras=True)
+    copy(root, tmp_path / "copy")
+    spec = spec_of(cameras=True)
+    more = random_episode(spec, 7, 50)
+    recipe = {"policy": "script", "seed": 0}
+    with DatasetWriter(tmp_path / "copy", spec, recipe, resume=True) as writer:
+        writer.write([more])
+    tables = [path.name for path in (tmp_path / "copy/meta/episodes").glob("*/*")]
+    assert tables == ["file-000.parquet"]
+    for ours, theirs in zip([*episodes, more], read_episodes(tmp_path / "copy"), strict=True):
+        assert_same(ours, theirs)
+    assert all(check.passed for check in validate(tmp_path / "copy"))
 
 
 def test_resume_refuses_another_spec_or_recipe_by_name(make_dataset):

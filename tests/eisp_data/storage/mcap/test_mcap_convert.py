@@ -19,7 +19,8 @@ from mcap_samples import (
 )
 
 from eisp_data.errors import ConfigError, DataError
-from eisp_data.storage.lerobot import read_episodes
+from eisp_data.storage.episodes import read_index
+from eisp_data.storage.lerobot import read_episodes, read_recipe, read_spec
 from eisp_data.storage.mcap import convert as convert_module
 from eisp_data.storage.mcap import messages, timeline
 from eisp_data.storage.mcap.convert import (
@@ -28,6 +29,7 @@ from eisp_data.storage.mcap.convert import (
     suggested_mapping,
 )
 from eisp_data.storage.mcap.writer import McapWriter
+from eisp_data.storage.rewrite import Source, rewrite
 
 
 def test_each_row_holds_what_the_recording_says_at_its_time(
@@ -127,6 +129,21 @@ def test_a_conversion_that_was_interrupted_goes_on_to_the_same_dataset(
         assert (report.written, report.episodes) == (6 - stop_after, 6)
         for a, b in zip(read_episodes(tmp_path / "whole"), read_episodes(target), strict=True):
             assert same(a, b)
+
+
+def test_resume_converts_what_a_repair_had_lost_and_nothing_twice(tmp_path: Path) -> None:
+    files = tuple(
+        record_session(tmp_path / f"{i}.mcap", episodes=3, steps=5, camera=False) for i in range(2)
+    )
+    whole, less = tmp_path / "whole", tmp_path / "less"
+    convert(ConvertConfig(inputs=files, to=whole))
+    kept = Source(read_index(whole), [0, 2, 3, 5])
+    rewrite([kept], less, read_spec(whole), read_recipe(whole))
+    assert convert(ConvertConfig(inputs=files, to=less, resume=True)).written == 2
+    episodes = list(read_episodes(whole))
+    expected = [episodes[number] for number in (0, 2, 3, 5, 1, 4)]
+    assert all(map(same, expected, read_episodes(less)))
+    assert convert(ConvertConfig(inputs=files, to=less, resume=True)).written == 0
 
 
 def test_another_recording_or_rule_cannot_be_resumed_into_a_dataset(tmp_path: Path) -> None:

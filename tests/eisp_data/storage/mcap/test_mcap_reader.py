@@ -283,6 +283,38 @@ def test_checks_name_what_is_wrong(tmp_path: Path, session_file: Path) -> None:
     assert not {check.name: check for check in checks(cut)}["whole"].passed
 
 
+@pytest.mark.parametrize(
+    ("library", "messages", "missing"),
+    [
+        ("other", [("/a", 0), ("/b", 0), ("/a", 1), ("/a", 4), ("/b", 1)], {"/a": 2}),
+        ("other", [("/a", 7), ("/a", 9)], {"/a": 1}),
+        ("other", [("/once", 0), ("/a", 7), ("/a", 9)], {"/a": 1}),
+        ("one count for all", [("/a", 1), ("/b", 2), ("/b", 3), ("/a", 4), ("/b", 7)], {}),
+        ("two publishers", [("/a", 1), ("/a", 90), ("/a", 2), ("/a", 91)], {}),
+        ("none", [("/a", 0), ("/b", 0), ("/a", 0)], {}),
+        ("eisp-data", [("/a", 1), ("/b", 2), ("/b", 3), ("/a", 4)], {"/a": 2}),
+        ("eisp-data", [("/a", 1), ("/a", 5), ("/a", 2)], {"/a": 3}),
+    ],
+)
+def test_numbers_that_do_not_count_a_channel_show_no_loss_on_it(
+    tmp_path: Path, library: str, messages: list[tuple[str, int]], missing: dict[str, int]
+) -> None:
+    path = tmp_path / "x.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(library=library)
+        channels = {t: writer.register_channel(t, "json", 0) for t in sorted(dict(messages))}
+        for at, (topic, number) in enumerate(messages):
+            writer.add_message(channels[topic], at, b"{}", at, number)
+        writer.finish()
+    (check,) = [check for check in checks(path) if check.name == "nothing dropped"]
+    assert check.passed == (not missing)
+    assert all(f"{topic}: {n} missing" in check.detail for topic, n in missing.items()), (
+        check.detail
+    )
+    assert repair(path).missing == missing
+
+
 def test_the_walk_holds_no_more_than_one_segment(session_file: Path) -> None:
     with McapLog(session_file) as log:
         assert max(s.length for s in log.layout.segments) < 2 * FAST.chunk_bytes
