@@ -122,10 +122,6 @@ class Aim:
             return position + np.append(miss, 0.0)
         return self.at(position)
 
-    def part(self, whole: int) -> int:
-        """Return how much of a task of so many parts to do."""
-        return int(self.rng.integers(1, whole + 1)) if self.noise.partial else whole
-
 
 Script = Callable[[View, Aim], Iterator[Keyframe]]
 

@@ -78,6 +78,7 @@ class Session:
         self._goal = np.empty(0)
         self._subgoal: np.ndarray | None = None
         self._look: Look | None = None
+        self._look_due = False
         self._subgoals, self._by_human, self._at_ns = 0, False, 0
 
     def run_episode(
@@ -103,7 +104,7 @@ class Session:
             RobotError: the robot or a camera does not answer, or something cannot be seen.
         """
         self._eyes, self._goal, self._subgoal = eyes, goal, None
-        self._look = None
+        self._look, self._look_due = None, False
         self._mover.start()
         self._subgoals, self._by_human = 0, False
         # The table may have been set anew: an image from before shows another one.
@@ -189,8 +190,9 @@ class Session:
         return self._decide(controller, seen)
 
     def _poll(self, part: int) -> None:
-        # Right after a command there is most time until the next one.
-        looks = part == 1
+        # Right after a command there is most time until the next one. A tick that took too long for
+        # that puts it off: to the next poll in time, at worst to the one before the next tick.
+        looks, self._look_due = self._look_due, part == 0
         self._log.sense(looks)
         frames = self._log.frames.items() if looks else ()
         fresh = {name: frame for name, frame in frames if frame.captured_s >= self._since_s}

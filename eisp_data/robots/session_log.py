@@ -6,7 +6,7 @@ of a simulated robot has the same spacing however long the simulation took.
 =========================  =============================  =======================================
 topic                      message                        role in a dataset
 =========================  =============================  =======================================
-/joint_states              ``foxglove.JointStates``       extra, or the state if there is no task
+/joint_states              ``foxglove.JointStates``       extra: positions and velocities
 /gripper                   ``eisp.Vector``                extra: the opening
 /camera/<name>/image       ``foxglove.CompressedImage``   image
 /joint_command             ``eisp.Vector``                extra: what was really sent
@@ -48,7 +48,6 @@ class SessionLog:
         robot: Robot,
         path: Path,
         metadata: Mapping[str, str],
-        joints_role: str | None = None,
         images: bool = True,
     ) -> None:
         """Create the file.
@@ -57,11 +56,10 @@ class SessionLog:
             robot: connected.
             path: must not exist yet.
             metadata: describes the session.
-            joints_role: what a dataset makes of the joints; None lets the conversion choose.
             images: whether they are recorded; if not, those that nobody asks for are not taken.
         """
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._robot, self._joints_role, self._images = robot, joints_role, images
+        self._robot, self._images = robot, images
         self._writer = McapWriter(path, metadata=metadata)
         # Whole microseconds, or rounding would part what has one stamp.
         self._epoch_ns = (self._writer.now_ns() - self._now_ns()) // 1000 * 1000
@@ -139,7 +137,7 @@ class SessionLog:
             reading.joint_velocity,
             reading.joint_effort,
         )
-        self._writer.log("/joint_states", message, at, self._joints_role)
+        self._writer.log("/joint_states", message, at, "extra.joints")
         opening = [reading.gripper_opening_m]
         self._writer.vector("/gripper", opening, at, (_OPENING,), "extra.gripper")
 

@@ -139,8 +139,7 @@ def run_session(
 
 @contextlib.contextmanager
 def _recording(cell: Cell, plan: Plan, report: Report) -> Iterator[SessionLog]:
-    role = "extra.joints" if cell.task is not None else None
-    log = SessionLog(cell.robot, plan.output, plan.metadata, joints_role=role, images=plan.images)
+    log = SessionLog(cell.robot, plan.output, plan.metadata, images=plan.images)
     try:
         yield log
     finally:

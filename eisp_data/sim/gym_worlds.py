@@ -38,6 +38,7 @@ class GymWorlds:
         success: (N,) bool, as the environment itself says; False until the first step where it
             says nothing at the reset.
         done: (N,) bool: the environment itself ended the episode.
+        truncated: (N,) bool: it cut the episode off, after L steps at the latest.
         steps: (N,) int64, actions since the last reset.
     """
 
@@ -64,6 +65,7 @@ class GymWorlds:
         self.desired_goal = np.zeros((count, self.goal_dim), np.float32)
         self.success = np.zeros(count, bool)
         self.done = np.zeros(count, bool)
+        self.truncated = np.zeros(count, bool)
         self.steps = np.zeros(count, np.int64)
         self._seeds = np.zeros(count, np.int64)
         self._actions = np.zeros((count, self.episode_steps, self.action_dim), np.float32)
@@ -75,7 +77,7 @@ class GymWorlds:
         for index, seed in zip(indices, seeds, strict=True):
             seen, info = self._envs[index].reset(seed=int(seed))
             self._see(index, seen, info)
-            self.done[index] = False
+            self.done[index] = self.truncated[index] = False
             self._seeds[index] = seed
         self.steps[indices] = 0
 
@@ -91,14 +93,14 @@ class GymWorlds:
 
     def _turn_page(self) -> None:
         """Go on in new arrays: who has taken one keeps what it was shown, as with ``Worlds``."""
-        for name in (*_PARTS, "success", "done"):
+        for name in (*_PARTS, "success", "done", "truncated"):
             setattr(self, name, getattr(self, name).copy())
 
     def _step(self, index: int, action: np.ndarray) -> None:
         scaled = self._centre + self._half * np.clip(action, -1.0, 1.0)
-        seen, _, done, _, info = self._envs[index].step(scaled.astype(self._centre.dtype))
+        seen, _, done, truncated, info = self._envs[index].step(scaled.astype(self._centre.dtype))
         self._see(index, seen, info)
-        self.done[index] = done
+        self.done[index], self.truncated[index] = done, truncated
         self._actions[index, self.steps[index]] = action
         self.steps[index] += 1
 
@@ -119,16 +121,13 @@ class GymWorlds:
         """(N,) bool: False; a foreign environment ends such an episode itself."""
         return np.zeros(self.count, bool)
 
-    @property
-    def truncated(self) -> np.ndarray:
-        """(N,) bool: the episode has had its L steps."""
-        return self.steps >= self.episode_steps
-
     def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray) -> np.ndarray:
         """Return the environment's own reward for (n, G) goals, (n,) float32."""
         env: Any = self._envs[0].unwrapped
-        reward = env.compute_reward(achieved_goal, desired_goal, {})
-        return np.broadcast_to(np.asarray(reward, np.float32), len(achieved_goal)).copy()
+        # A GoalEnv need not know what to do with more than one row.
+        rows = zip(achieved_goal, desired_goal, strict=True)
+        rewards = [env.compute_reward(*row, {}) for row in rows]
+        return np.array(rewards, np.float32).reshape(len(achieved_goal))
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return all that ``restore_snapshot`` needs: seeds and actions, for nothing else is

@@ -7,6 +7,7 @@ import signal
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from bench_robot import BenchRobot
 from hand_on_device import HandOnGamepad, HandOnKeyboard
@@ -14,9 +15,10 @@ from image_samples import skip_without_opengl
 
 from eisp_data.errors import ConfigError, EispError, RobotError
 from eisp_data.robots import registry, teleop
-from eisp_data.robots.loop import Ticks
+from eisp_data.robots.loop import POLLS, Ticks
 from eisp_data.robots.record import RecordConfig, check, record
 from eisp_data.robots.session import Session
+from eisp_data.robots.session_view import HandEyes
 from eisp_data.storage.lerobot import read_episodes
 from eisp_data.storage.mcap.convert import ConvertConfig, convert
 from eisp_data.storage.mcap.reader import McapLog
@@ -80,6 +82,37 @@ def test_each_source_is_recorded_at_its_own_rate_with_its_own_time(
     assert set(np.round(steps * 30)) == {1.0, 2.0}
 
 
+@pytest.mark.parametrize(("work_s", "poll"), [(0.005, 1), (0.015, 2), (0.025, 3), (0.035, 0)])
+def test_a_tick_that_takes_long_puts_off_the_look_at_the_images_and_never_cancels_it(
+    tmp_path: Path,
+    bench: type[BenchRobot],
+    monkeypatch: pytest.MonkeyPatch,
+    work_s: float,
+    poll: int,
+) -> None:
+    class SlowHand(HandOnGamepad):
+        def get_action(self) -> dict[str, float]:
+            robot = bench.made[0]
+            robot.wait_until(robot.now_s() + work_s)
+            return super().get_action()
+
+    looked_s: list[float] = []
+
+    def look(self: HandEyes, frames: dict[str, object], reading: object) -> None:
+        if frames:
+            looked_s.append(bench.made[0].now_s())
+
+    hand_on(monkeypatch, SlowHand(reads=20))
+    monkeypatch.setattr(HandEyes, "look", look)
+    start_s = BenchRobot().now_s()
+    bench.made.clear()
+    record(recorded(tmp_path))
+    polls = np.round((np.array(looked_s) - start_s) / (PERIOD_S / POLLS))
+    assert (polls % POLLS == poll).all()
+    # One look a tick; in the first there is no image yet.
+    assert (np.diff(polls) == POLLS).all() and len(polls) >= 19
+
+
 def test_a_teleoperated_session_becomes_a_dataset_of_what_the_hand_did(
     tmp_path: Path, bench: type[BenchRobot], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -88,6 +121,10 @@ def test_a_teleoperated_session_becomes_a_dataset_of_what_the_hand_did(
     convert(ConvertConfig(inputs=(report.output,), to=tmp_path / "data"))
     [episode] = read_episodes(tmp_path / "data")
     assert episode.action.shape == (20, 4) and episode.observation.shape[0] == 21
+    [table] = (tmp_path / "data").glob("data/*/*.parquet")
+    joints = np.array(pq.read_table(table)["joints"].to_pylist())
+    sent = np.array([command.joint_position for command in bench.made[0].sent])
+    np.testing.assert_allclose(joints[1:, :6], sent[: len(joints) - 1], atol=1e-6)
     np.testing.assert_allclose(episode.action, np.tile([0.1, 0.05, 0.0, -1.0], (20, 1)), atol=1e-6)
     assert episode.info["outcome"] == "success"
     way = episode.achieved_goal[-1] - episode.achieved_goal[0]

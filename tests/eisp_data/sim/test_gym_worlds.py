@@ -13,35 +13,47 @@ from eisp_data.sim.gym_worlds import GymWorlds
 class Line(gymnasium.Env):
     """A point on a line from -10 to 10 that ends at the goal; its actions are in [0, 4]."""
 
-    def __init__(self):
+    def __init__(self, patience=99):
         box = spaces.Box(-10.0, 10.0, (1,), np.float64)
         self.observation_space = spaces.Dict(observation=box, achieved_goal=box, desired_goal=box)
         self.action_space = spaces.Box(0.0, 4.0, (1,), np.float32)
+        self.patience, self.left = patience, 0
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.place, self.goal = np.zeros(1), self.np_random.uniform(5, 6, 1)
+        self.left = self.patience
         return self._seen(), {}
 
     def _seen(self):
         return {"observation": self.place, "achieved_goal": self.place, "desired_goal": self.goal}
 
     def compute_reward(self, achieved_goal, desired_goal, info):
-        return -np.abs(achieved_goal - desired_goal).sum(-1)
+        return -abs(achieved_goal[0] - desired_goal[0])
 
     def step(self, action):
-        assert self.action_space.contains(action)
+        assert self.action_space.contains(action) and self.left > 0
+        self.left -= 1
         self.place = self.place + action
         done = bool(self.place[0] >= self.goal[0])
-        return self._seen(), 0.0, done, False, {"is_success": done}
+        return self._seen(), 0.0, done, self.left == 0, {"is_success": done}
+
+
+class VectorisedLine(Line):
+    """Its rewards are an array whatever it is asked for, as replay buffers want it."""
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        return -np.abs(np.atleast_2d(achieved_goal - desired_goal)).sum(1)
 
 
 @pytest.fixture(autouse=True, scope="module")
 def registered():
     gymnasium.register("Line-v0", Line, max_episode_steps=8)
+    gymnasium.register("VectorisedLine-v0", VectorisedLine, max_episode_steps=8)
+    gymnasium.register("ImpatientLine-v0", Line, max_episode_steps=8, kwargs={"patience": 3})
     gymnasium.register("Endless-v0", Line)
     yield
-    for name in ("Line-v0", "Endless-v0"):
+    for name in ("Line-v0", "VectorisedLine-v0", "ImpatientLine-v0", "Endless-v0"):
         del gymnasium.registry[name]
 
 
@@ -108,6 +120,31 @@ def test_an_episode_ends_where_the_environment_ends_it():
     assert episode.done[-1] != episode.truncated[-1]
     assert not episode.done[:-1].any()
     assert np.allclose(episode.reward, -np.abs(episode.achieved_goal[1:, 0] - episode.desired_goal))
+
+
+@pytest.mark.parametrize("env_id", ["Line-v0", "VectorisedLine-v0"])
+def test_rewards_are_those_of_each_row_whether_or_not_the_environment_takes_many(env_id):
+    achieved, desired = np.array([[1.0], [2.0], [5.0]]), np.array([[1.5], [5.0], [5.0]])
+    reward = GymWorlds(env_id, 1).compute_reward(achieved, desired)
+    assert reward.dtype == np.float32
+    assert reward.tolist() == [-0.5, -3.0, 0.0]
+
+
+def test_an_episode_that_the_environment_cuts_off_early_waits_for_its_reset():
+    worlds = GymWorlds("ImpatientLine-v0", 1)
+    worlds.reset([0])
+    for _ in range(5):
+        worlds.step(np.full((1, 1), -1.0))
+    assert worlds.truncated[0] and not worlds.done[0]
+    assert worlds.steps[0] == 3
+    again = GymWorlds("ImpatientLine-v0", 1)
+    again.restore_snapshot(worlds.snapshot())
+    assert again.truncated[0] and again.steps[0] == 3
+    worlds.reset([0])
+    assert not worlds.truncated[0]
+    episodes = list(explore(worlds, range(6)))
+    assert max(len(episode) for episode in episodes) == 3
+    assert any(episode.truncated[-1] for episode in episodes)
 
 
 def test_random_episodes_depend_on_their_seeds_alone():
