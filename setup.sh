@@ -1,5 +1,5 @@
 #!/bin/sh
-# Finds a Python >= 3.12, makes .venv with it and installs the project there at pinned versions.
+# Finds a Python 3.12 or 3.13, makes .venv with it and installs the project there at pinned versions.
 #   ./setup.sh                 install; run again whenever pyproject.toml or constraints.txt change
 #   ./setup.sh --find-python   only print the interpreter that would be used
 #   PYTHON=/path/to/python3.12 ./setup.sh
@@ -11,24 +11,25 @@ usable() {
     # ensurepip, which venv needs, in a package of its own.
     [ -x "$1" ] && "$1" -c '
 import ensurepip, sys, venv
-sys.exit(not (3, 12) <= sys.version_info[:2] <= (3, 14))' >/dev/null 2>&1
+sys.exit(not (3, 12) <= sys.version_info[:2] <= (3, 13))' >/dev/null 2>&1
 }
 
-# The pinned versions were resolved on 3.12, so that comes first.
+# The pinned versions were resolved on 3.12, so that comes first; LeRobot needs a NumPy that has no
+# wheel for 3.14.
 candidates() {
-    for version in 3.12 3.13 3.14 3 ''; do
+    for version in 3.12 3.13 3 ''; do
         (
             IFS=:
             for folder in $PATH; do echo "$folder/python$version"; done
         )
     done
-    for version in 3.12 3.13 3.14; do
+    for version in 3.12 3.13; do
         for python in "${PYENV_ROOT:-$HOME/.pyenv}/versions/$version"*/bin/python3; do
             echo "$python"
         done
     done
     if command -v uv >/dev/null 2>&1; then
-        UV_PYTHON_DOWNLOADS=never uv python find --no-project '>=3.12,<3.15' 2>/dev/null || true
+        UV_PYTHON_DOWNLOADS=never uv python find --no-project '>=3.12,<3.14' 2>/dev/null || true
     fi
 }
 
@@ -39,7 +40,7 @@ find_python() {
             echo "$chosen"
             return
         fi
-        echo "error: PYTHON=$PYTHON is not a Python 3.12, 3.13 or 3.14 with the venv module" >&2
+        echo "error: PYTHON=$PYTHON is not a Python 3.12 or 3.13 with the venv module" >&2
         return 1
     fi
     candidates | {
@@ -50,8 +51,8 @@ find_python() {
             fi
         done
         cat >&2 <<'MESSAGE'
-error: no Python 3.12, 3.13 or 3.14 with the venv module was found on PATH, among pyenv's versions
-or by uv. Install one, then run this again:
+error: no Python 3.12 or 3.13 with the venv module was found on PATH, among pyenv's versions or by
+uv. Install one, then run this again:
     Debian, Ubuntu   apt install python3.12 python3.12-venv   (python3.13 on Debian 13)
     Fedora           dnf install python3.12
     macOS            brew install python@3.12
@@ -68,7 +69,8 @@ if [ "${1:-}" = --find-python ]; then
     exit
 fi
 
-if ! usable .venv/bin/python; then
+# Without pip it was made by uv, or never made to the end.
+if ! usable .venv/bin/python || ! .venv/bin/python -m pip --version >/dev/null 2>&1; then
     python=$(find_python)
     echo "Making .venv with $python"
     "$python" -m venv --clear .venv

@@ -40,7 +40,7 @@ def resolved_versions(requirements: list[Requirement]) -> dict[str, str]:
             try:
                 installed = distribution(name)
             except PackageNotFoundError:
-                raise SystemExit(f"error: {name} is not installed; run make install") from None
+                raise SystemExit(f"error: {name} is missing; use make constraints") from None
             versions[name] = installed.version
             queue += [(Requirement(text), wanted) for text in installed.requires or []]
     return versions

@@ -260,8 +260,8 @@ def _one_line_errors(what: str) -> Iterator[None]:
         raise DataError(f"{what}: HF_HUB_OFFLINE is set; unset it to reach a Hub") from None
     except httpx.ConnectError as error:
         raise DataError(
-            f"{what}: cannot reach {constants.ENDPOINT} ({one_line(error)}); run it again to go on"
+            f"{what}: cannot reach {constants.ENDPOINT} ({one_line(error)}); run it again"
         ) from None
     except (httpx.HTTPError, HFValidationError, OSError, RuntimeError, ValueError) as error:
         cause = error.__cause__ or error
-        raise DataError(f"{what}: failed ({one_line(cause)}); run it again to go on") from None
+        raise DataError(f"{what}: failed ({one_line(cause)}); run it again") from None
