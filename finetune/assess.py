@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 from eisp_data.config import at_least, check_seed
 from eisp_data.errors import ConfigError
 from eisp_data.storage.files import check_writable
@@ -20,7 +22,7 @@ _BATCH = 100
 
 
 def assess(config: EvaluateConfig) -> Evaluation:
-    """Evaluate a policy, and film its first episode if asked to."""
+    """Evaluate a policy, and film its first episode if asked to and if this machine can."""
     at_least(1, {"--episodes": config.episodes, "--threads": config.threads})
     check_seed(config.seed)
     check_subgoals(config.subgoals, "--subgoals")
@@ -38,9 +40,11 @@ def assess(config: EvaluateConfig) -> Evaluation:
         config.episodes,
         config.seed,
         oracle=oracle_return(state_task(name), min(_ORACLE_EPISODES, config.episodes), config.seed),
-        device=device,
         watch=film if config.video else None,
     )
     if config.video:
-        film.write(config.video)
+        try:
+            film.write(config.video)
+        except ConfigError as error:  # no OpenGL: that is no reason to lose the figures
+            print(f"no film: {error}", file=sys.stderr)
     return result

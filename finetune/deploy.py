@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from itertools import count
 from pathlib import Path
 
@@ -32,7 +32,12 @@ from pretrain.device import set_up
 from pretrain.layout import Layout
 from pretrain.saved import saved_subgoals
 
-RESULTS, SETTINGS, CURVE = "results.jsonl", "deploy.yaml", "distance.svg"
+RESULTS, SETTINGS = "results.jsonl", "deploy.yaml"
+_MAY_DIFFER = {
+    *("output_dir", "resume", "episodes", "pause_s", "record_images"),
+    *("host", "camera_source", "realtime", "device", "threads"),
+}
+"""Settings that do not decide how an episode goes."""
 _STEP_S = 0.04
 _LOOKS = 2.5
 """With looks an episode may take so many times as long as the policy's steps alone."""
@@ -61,7 +66,7 @@ class _Run:
         if self.agent is None:
             found = Script(self.task)
         else:
-            found = PolicyController(self.agent, self.config.device)
+            found = PolicyController(self.agent)
             if self.config.look:
                 found = Looking(found, self.task)
         limited = Limited(found, self.task.paper.episode_steps)
@@ -146,7 +151,9 @@ def policy_controller(path: Path | None, task: Task) -> Controller:
 
 
 def load_policy(path: Path | None, task: Task, subgoals: SubgoalConfig, device: str) -> Agent:
-    """Read a policy for a task; ConfigError if it is one of another task."""
+    """Read a policy for a task; ConfigError if it is one of another task or needs a simulator."""
+    if subgoals.source == "oracle":
+        raise ConfigError("--subgoals.source oracle needs a simulator; choose another for a robot")
     agent = load_for_rollouts(path, subgoals, device)
     if agent.config.task != task.name:
         raise ConfigError(f"{path} is a policy of {agent.config.task!r}, not of {task.name!r}")
@@ -203,19 +210,11 @@ def _done_before(config: DeployConfig) -> int:
 
 def _check_same(config: DeployConfig, begun: DeployConfig) -> None:
     """Raise ConfigError if episodes of the two would not be of one kind."""
-    ours, theirs = (
-        {
-            "--robot": each.robot,
-            "--task": each.task,
-            "--control": each.control,
-            "--policy.path": each.policy.path,
-            "--subgoals": each.subgoals,
-            "--seed": each.seed,
-            "--interference": each.interference,
-        }
-        for each in (config, begun)
-    )
-    different = [flag for flag, value in ours.items() if value != theirs[flag]]
+    different = [
+        f"--{one.name.replace('_', '-')}"
+        for one in fields(DeployConfig)
+        if one.name not in _MAY_DIFFER and getattr(config, one.name) != getattr(begun, one.name)
+    ]
     if different:
         raise ConfigError(
             f"--resume: {config.output_dir} was begun with another {', '.join(different)}; give "
@@ -259,8 +258,8 @@ def _draw(run: _Run) -> None:
     traces = read_traces(run.report.output)
     if not traces or cell is None:
         return
-    curve = config.output_dir / CURVE
-    curve.write_text(distance_curve(traces, SUCCESS_DISTANCE_M))
+    curve = run.report.output.with_suffix(".svg")
+    curve.write_text(distance_curve(traces, run.first, SUCCESS_DISTANCE_M))
     print(f"{curve}: distance to the goal over time")
     if not config.record_images or cell.camera is None:
         return

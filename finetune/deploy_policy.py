@@ -38,9 +38,9 @@ class PolicyController:
         at_subgoal: whether the subgoal of the last step was reached when this one began.
     """
 
-    def __init__(self, agent: Agent, device: str = "cpu") -> None:
+    def __init__(self, agent: Agent) -> None:
         self.name = "eisp"
-        self._rollout = SubgoalPolicy(agent, 1, device)
+        self._rollout = SubgoalPolicy(agent, 1)
         self._goal = np.empty(0)
         self._begun = self.at_subgoal = False
 

@@ -64,7 +64,7 @@ def _take(traces: list[Trace], entry: Entry, decoded: decode.Decoded) -> None:
     if isinstance(decoded, decode.Event):
         if decoded.kind == "episode_start":
             traces.append(Trace(at))
-        elif decoded.kind == "episode_end" and traces:
+        elif decoded.kind == "episode_end" and traces and not traces[-1].end_ns:
             traces[-1].end_ns = at
         return
     if not isinstance(decoded, decode.Vector) or not traces:
@@ -79,10 +79,16 @@ def _take(traces: list[Trace], entry: Entry, decoded: decode.Decoded) -> None:
         trace.subgoals.append((at, decoded.values))
 
 
-def distance_curve(traces: list[Trace], tolerance_m: float) -> str:
-    """Return the paper's Fig. "distance" as an SVG file: distance to the goal over time."""
+def distance_curve(traces: list[Trace], first: int, tolerance_m: float) -> str:
+    """Return the paper's Fig. "distance" as an SVG file: distance to the goal over time.
+
+    Args:
+        traces: of episodes.
+        first: number of the first of them.
+        tolerance_m: drawn as a line.
+    """
     series = []
-    for number, trace in enumerate(traces):
+    for number, trace in enumerate(traces, start=first):
         times_s = (np.array(trace.times_ns) - trace.times_ns[0]) / 1e9
         every = max(1, round(_DRAWN_EVERY_S * len(times_s) / max(times_s[-1], 1e-9)))
         series.append(

@@ -79,7 +79,6 @@ def evaluate(
     seed: int,
     *,
     oracle: float | None = None,
-    device: str = "cpu",
     watch: Callable[[AnyWorlds, SubgoalPolicy], None] | None = None,
 ) -> Evaluation:
     """Run the policy without exploration.
@@ -90,7 +89,6 @@ def evaluate(
         episodes: how many; they have the seeds ``seed``, ``seed + 1`` and so on.
         seed: the first.
         oracle: mean return of the oracle, for the relative return.
-        device: where the agent is.
         watch: called with worlds and policy after every step of the first batch.
     """
     parts = []
@@ -98,7 +96,7 @@ def evaluate(
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         for first in range(0, episodes, worlds.count):
-            parts.append(_batch(agent, worlds, seed + first, device, watch if first == 0 else None))
+            parts.append(_batch(agent, worlds, seed + first, watch if first == 0 else None))
     last, settled, some, returns, distance = (
         np.concatenate(column)[:episodes] for column in zip(*parts, strict=True)
     )
@@ -131,11 +129,10 @@ def _batch(
     agent: Agent,
     worlds: AnyWorlds,
     seed: int,
-    device: str,
     watch: Callable[[AnyWorlds, SubgoalPolicy], None] | None,
 ) -> tuple[np.ndarray, ...]:
     worlds.reset(range(seed, seed + worlds.count))
-    policy = subgoal_policy(agent, worlds, device)
+    policy = subgoal_policy(agent, worlds)
     returns = np.zeros(worlds.count)
     some = worlds.success
     for _ in range(worlds.episode_steps):

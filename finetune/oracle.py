@@ -28,8 +28,8 @@ class OracleSubgoals(SubgoalPolicy):
     are right whatever has happened before.
     """
 
-    def __init__(self, agent: Agent, worlds: AnyWorlds, device: str) -> None:
-        super().__init__(agent, worlds.count, device)
+    def __init__(self, agent: Agent, worlds: AnyWorlds) -> None:
+        super().__init__(agent, worlds.count)
         if not isinstance(worlds, Worlds) or agent.vision:
             raise ConfigError(
                 f"--subgoals.source oracle: {worlds.name} has no scripted policy, or none that "
@@ -72,11 +72,11 @@ def _first(path: np.ndarray, goal: np.ndarray) -> np.ndarray:
     return rests[nearer[0] if len(nearer) else 0]
 
 
-def subgoal_policy(agent: Agent, worlds: AnyWorlds, device: str) -> SubgoalPolicy:
+def subgoal_policy(agent: Agent, worlds: AnyWorlds) -> SubgoalPolicy:
     """Return the policy whose subgoals come from where the agent's settings say."""
     if agent.config.subgoals.source == "oracle":
-        return OracleSubgoals(agent, worlds, device)
-    return SubgoalPolicy(agent, worlds.count, device)
+        return OracleSubgoals(agent, worlds)
+    return SubgoalPolicy(agent, worlds.count)
 
 
 def oracle_return(name: str, episodes: int, seed: int) -> float | None:

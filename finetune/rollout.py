@@ -31,8 +31,8 @@ class SubgoalPolicy:
             was reached; infinite where there are less.
     """
 
-    def __init__(self, agent: Agent, worlds: int, device: str = "cpu") -> None:
-        self._agent, self._device = agent, device
+    def __init__(self, agent: Agent, worlds: int) -> None:
+        self._agent = agent
         self._config = agent.config.subgoals
         self.subgoal = np.zeros((worlds, agent.layout.goal_dim), np.float32)
         self.age = np.full(worlds, self._config.every_steps)
@@ -167,4 +167,4 @@ class SubgoalPolicy:
         return self._agent.proposer.propose(state, goal, count)
 
     def _tensor(self, array: np.ndarray) -> Tensor:
-        return torch.from_numpy(np.ascontiguousarray(array)).to(self._device)
+        return torch.from_numpy(np.ascontiguousarray(array)).to(self._agent.bank.device)

@@ -65,7 +65,6 @@ def finetune(config: FinetuneConfig) -> dict[str, float]:
         lambda count: make_worlds(agent, count),
         config.online,
         config.seed,
-        device,
         config.threads,
     )
     if resumed:

@@ -128,7 +128,6 @@ class Finetuner:
         make_worlds: makes a batch of worlds of a given size.
         config: the hyperparameters.
         seed: of the run.
-        device: where the agent is.
         threads: how many cores an update may use.
     """
 
@@ -140,11 +139,10 @@ class Finetuner:
         make_worlds: Callable[[int], AnyWorlds],
         config: OnlineConfig,
         seed: int,
-        device: str,
         threads: int,
     ) -> None:
         self.run, self.agent, self.config = run, agent, config
-        self._offline_mix, self._device = agent.config.mix, device
+        self._offline_mix = agent.config.mix
         self._mix = _with_pursued(agent.config.mix, config.pursued)
         self._rng = np.random.default_rng(seed)
         torch.manual_seed(seed)
@@ -161,7 +159,7 @@ class Finetuner:
                 f"--online.round-steps {config.round_steps} must divide the "
                 f"{worlds.episode_steps} steps of an episode"
             )
-        policy = subgoal_policy(agent, worlds, device)
+        policy = subgoal_policy(agent, worlds)
         self._rollouts = Rollouts(
             worlds,
             policy,
@@ -171,14 +169,13 @@ class Finetuner:
         self._evaluation_worlds = make_worlds(min(100, config.evaluation_episodes))
         self._curve: list[dict[str, float]] = []
         self._best = -np.inf, -np.inf
-        self._round = 0
+        self._round = self._updates = self._env_steps = 0
         self._spent = 0.0
 
     def __call__(self) -> dict[str, float]:
         """Train, or go on training, to the last round; return the summary of the run."""
         begun = bool(self._curve)
-        done = self._round * self.config.updates if begun else -1
-        log = MetricsLog(self.run, "finetune", done)
+        log = MetricsLog(self.run, "finetune", self._updates if begun else -1)
         start = time.monotonic() - self._spent
         if not begun:
             self._rollouts.start(np.arange(self.config.worlds))
@@ -192,6 +189,8 @@ class Finetuner:
             self._online.extend(*trajectories)
             with speeds.measured("updates", self.config.updates):
                 info = self._learn()
+            self._env_steps += self.config.worlds * self.config.round_steps
+            self._updates += self.config.updates
             if self._round % self.config.evaluate_every == 0 or self._round == self.config.rounds:
                 result = self._evaluate(log, {**info, **speeds.taken()}, start)
                 bar.set_postfix(success=result.success_last.mean, return_=result.return_.mean)
@@ -235,24 +234,22 @@ class Finetuner:
         self, log: MetricsLog, info: Mapping[str, Tensor | float], start: float
     ) -> Evaluation:
         result = self._try(0, self.config.evaluation_episodes)
-        env_steps = self._round * self.config.worlds * self.config.round_steps
         point = {
             "success_last": result.success_last.mean,
             "success_any": result.success_any.mean,
             "return": result.return_.mean,
         }
-        self._curve.append({"env_steps": env_steps, **point})
+        self._curve.append({"env_steps": self._env_steps, **point})
         self._choose(result)
         self._spent = time.monotonic() - start
         values: dict[str, float | Tensor] = {f"train/{k}": v for k, v in info.items()}
         values |= {f"eval/{k}": v for k, v in point.items()}
-        log.write(self._round * self.config.updates, env_steps, self._spent, values)
+        log.write(self._updates, self._env_steps, self._spent, values)
         self._checkpoint()
         return result
 
     def _try(self, first: int, count: int) -> Evaluation:
-        seed, worlds = _SELECTION_SEED + first, self._evaluation_worlds
-        return evaluate(self.agent, worlds, count, seed, device=self._device)
+        return evaluate(self.agent, self._evaluation_worlds, count, _SELECTION_SEED + first)
 
     def _choose(self, result: Evaluation) -> None:
         """Keep the policy as the best if it is, on the episodes of this evaluation and on more."""
@@ -275,18 +272,30 @@ class Finetuner:
             "online/pursued": online.pursued,
             "online/episode_start": online.episode_start,
         }
-        numbers = {"curve": self._curve, "best": self._best, "wall_s": self._spent}
+        numbers = {
+            "updates": self._updates,
+            "env_steps": self._env_steps,
+            "curve": self._curve,
+            "best": self._best,
+            "wall_s": self._spent,
+        }
         checkpoint.save(
             self.run, self._round, self.agent, self._learner.optimizers, self._rng, numbers, arrays
         )
 
     def restore(self) -> None:
-        """Go back to where the newest checkpoint was; DataError if it is of other settings."""
+        """Go back to the newest checkpoint; DataError if it is of other settings or older."""
         self._round, numbers, arrays = checkpoint.restore(
             self.run, self.agent, self._learner.optimizers, self._rng
         )
-        self._curve, self._spent = numbers["curve"], numbers["wall_s"]
-        success, return_ = numbers["best"]
+        try:
+            self._updates, self._env_steps = numbers["updates"], numbers["env_steps"]
+            self._curve, self._spent = numbers["curve"], numbers["wall_s"]
+            success, return_ = numbers["best"]
+        except KeyError as error:
+            raise DataError(
+                f"{self.run} is of another version: its checkpoint has no {error}"
+            ) from None
         self._best = success, return_
         names = ("observation", "achieved_goal", "action", "pursued", "episode_start")
         self._online.extend(*(arrays[f"online/{name}"] for name in names))

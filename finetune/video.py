@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from eisp_data.errors import DataError
+from eisp_data.storage.files import replace_atomically
 
 if TYPE_CHECKING:
     from eisp_data.sim.gym_worlds import AnyWorlds
@@ -90,7 +91,7 @@ class Film:
         steps = self._steps[: film_length(self._solved) : SPEED]
         with Renderer(get_task(self._task)) as renderer:
             frames = (renderer.render(state, self._goal, subgoal) for state, subgoal in steps)
-            write_video(path, frames, CONTROL_HZ)
+            replace_atomically(path, lambda draft: write_video(draft, frames, CONTROL_HZ))
 
 
 def film_length(solved: list[bool]) -> int:

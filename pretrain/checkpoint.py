@@ -42,7 +42,7 @@ def restore(
     Raises:
         DataError: it is damaged, or of an agent made with other settings.
     """
-    folder = run / "checkpoints" / "last"
+    folder = checkpoint.newest(run)
     saved = Agent.load(folder / MODEL).state_dict()
     try:
         agent.load_state_dict(saved)

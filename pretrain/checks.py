@@ -6,7 +6,8 @@ from eisp_data.config import above_zero, at_least, check_seed, zero_to_one
 from eisp_data.errors import ConfigError
 from pretrain.config import GoalMix, PretrainConfig, SubgoalConfig
 
-_ROUNDING = 1e-6
+_ROUNDING = 1e-8
+"""What ``numpy.random.Generator.choice`` allows."""
 
 
 def check_pretrain(config: PretrainConfig) -> None:

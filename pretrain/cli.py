@@ -39,6 +39,8 @@ def _start(words: list[str]) -> tuple[list[str], PretrainConfig | None]:
     words, name = take(words, "--preset")
     saved = saved_run(words, PretrainConfig, "pretrain.yaml")
     if saved or given(words, "--config"):
+        if name is not None:
+            raise ConfigError("--preset: with --resume and --config all settings are of a file")
         return words, saved
     known = cast(PresetName, preset_name(name, get_args(PresetName)))
     _, root = take(words, "--dataset.root")

@@ -66,7 +66,7 @@ def train(config: VqVaeTrainConfig) -> tuple[Path, Quality]:
     vision = VisionConfig(arrays.spec.task, config.dataset.camera, config.model, model.places)
     done, spent, finished = 0, 0.0, False
     if resumed:
-        folder = run / "checkpoints" / "last"
+        folder = checkpoint.newest(run)
         try:
             model.load_state_dict(saved.load(folder / MODEL)[0].state_dict())
         except RuntimeError as error:

@@ -12,8 +12,8 @@ from eisp_data.errors import ConfigError
 def take(words: Sequence[str], flag: str) -> tuple[list[str], str | None]:
     """Take ``flag VALUE`` or ``flag=VALUE`` out of the words; None if it is not there."""
     for index, word in enumerate(words):
-        name, equals, value = word.partition("=")
-        if name == flag:
+        _, equals, value = word.partition("=")
+        if _names(word, flag):
             if not equals and index + 1 == len(words):
                 raise ConfigError(f"{flag}: missing its value")
             rest = [*words[:index], *words[index + (1 if equals else 2) :]]
@@ -23,7 +23,12 @@ def take(words: Sequence[str], flag: str) -> tuple[list[str], str | None]:
 
 def given(words: Sequence[str], flag: str) -> bool:
     """Return whether the flag is among the words, with or without a value."""
-    return any(word.partition("=")[0] == flag for word in words)
+    return any(_names(word, flag) for word in words)
+
+
+def _names(word: str, flag: str) -> bool:
+    # The parser takes --output_dir for --output-dir.
+    return word.partition("=")[0].replace("_", "-") == flag
 
 
 def preset_name(value: str | None, choices: Sequence[str]) -> str:

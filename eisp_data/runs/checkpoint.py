@@ -1,7 +1,7 @@
 """Checkpoints in LeRobot's layout, that survive a kill at any moment.
 
 ``checkpoints/<step>/pretrained_model/`` is the model, ``checkpoints/<step>/training_state/`` what
-is needed to go on, ``checkpoints/last`` the newest. Nothing is pickled.
+is needed to go on, ``checkpoints/last`` a link to the newest. Nothing is pickled.
 """
 
 from __future__ import annotations
@@ -67,13 +67,15 @@ def save(
             link = folder.with_name(".last")
             link.unlink(missing_ok=True)
             link.symlink_to(folder.name)
-            link.rename(folder.with_name("last"))
+            last = folder.with_name("last")
+            if not last.is_symlink():  # a copy of the run may have made a folder of the link
+                shutil.rmtree(last, ignore_errors=True)
+            link.rename(last)
             sync(folder.parent)
     except DataError:
         shutil.rmtree(draft, ignore_errors=True)  # a full disk has better use for the room
         raise
-    steps = [path for path in folder.parent.iterdir() if path.name.isdigit()]
-    for old in sorted(steps, key=lambda path: int(path.name))[:-_KEPT]:
+    for old in _by_step(run)[:-_KEPT]:
         shutil.rmtree(old)
 
 
@@ -88,7 +90,7 @@ def restore(
     Raises:
         DataError: it is damaged, or of a run with other settings.
     """
-    folder = run / "checkpoints" / "last"
+    folder = newest(run)
     try:
         plain = json.loads((folder / _STATE / "state.json").read_text())
         tensors = load_file(folder / _STATE / "state.safetensors")
@@ -106,7 +108,23 @@ def restore(
 
 def exists(run: Path) -> bool:
     """Return whether the run has a checkpoint."""
-    return (run / "checkpoints" / "last" / _STATE / "state.json").exists()
+    return bool(_by_step(run))
+
+
+def newest(run: Path) -> Path:
+    """Return the folder of the newest checkpoint, whatever has become of the link to it.
+
+    Raises:
+        DataError: there is none.
+    """
+    if not exists(run):
+        raise DataError(f"{run} holds no checkpoint")
+    return _by_step(run)[-1]
+
+
+def _by_step(run: Path) -> list[Path]:
+    folders = (path for path in (run / "checkpoints").glob("*") if path.name.isdigit())
+    return sorted(folders, key=lambda path: int(path.name))
 
 
 def _write_state(

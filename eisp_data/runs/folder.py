@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from eisp_data.config import save_yaml
 from eisp_data.errors import ConfigError
@@ -48,10 +50,13 @@ def check_same_dataset(begun: Path, given: Path, file: Path) -> None:
         )
 
 
-def begin_run(run: Path, config: object, name: str) -> None:
-    """Make the folder of a run and write its configuration, once all input has proved usable."""
+def begin_run(run: Path, config: Any, name: str) -> None:
+    """Make the folder of a run and write its configuration, once all input has proved usable.
+
+    Not whether it was resumed: given back with ``--config`` it begins a run of its own.
+    """
     try:
         run.mkdir(parents=True, exist_ok=True)
-        save_yaml(config, run / name)
+        save_yaml(replace(config, resume=False), run / name)
     except OSError as error:
         raise ConfigError(f"cannot write to {run}: {error.strerror}") from None

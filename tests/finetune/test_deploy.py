@@ -32,6 +32,7 @@ from finetune.deploy_film import draw, film
 from finetune.deploy_policy import Looking
 from finetune.deploy_trace import distance_curve, read_traces
 from finetune.disturb import Hand
+from pretrain.config import SubgoalConfig
 
 STACK = TASKS["stack"]
 BLOCKS_M = np.array([[0.30, -0.10, 0.025], [0.30, 0.0, 0.025], [0.30, 0.10, 0.025]])
@@ -225,6 +226,8 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
             image = np.full((48, 64, 3), number, np.uint8)
             log.image("/camera/top/image", image, START_NS + number * SECOND_NS // 30)
         log.event("episode_end", START_NS + 2 * SECOND_NS)
+        # The look before the next one failed: an end without a start.
+        log.event("episode_end", START_NS + 20 * SECOND_NS)
     return path
 
 
@@ -236,8 +239,9 @@ def test_distances_and_subgoals_are_read_back_from_a_recording(recording: Path) 
     np.testing.assert_allclose(
         trace.subgoal_at(START_NS + SECOND_NS // 2), trace.goal + 0.1, atol=1e-9
     )
-    curve = distance_curve([trace], 0.05)
-    assert curve.startswith("<svg") and "polyline" in curve and "0.05 m" in curve
+    curve = distance_curve([trace], 7, 0.05)
+    assert curve.startswith("<svg") and "polyline" in curve
+    assert "0.05 m" in curve and "episode 7" in curve
 
 
 def test_a_film_lasts_as_long_as_its_episode_also_where_images_were_lost(
@@ -310,6 +314,7 @@ def config_for(tmp_path: Path, policy: Path | None, **options: object) -> Deploy
         ({"robot": "ur3"}, "missing --host"),
         ({"calibration": Path("nowhere.yaml")}, "nowhere.yaml"),
         ({"episodes": 0}, "--episodes must be at least 1"),
+        ({"subgoals": SubgoalConfig(source="oracle")}, "source oracle needs a simulator"),
     ],
 )
 def test_what_cannot_be_deployed_is_one_line(
@@ -324,7 +329,7 @@ def test_a_policy_on_the_twin_is_recorded_judged_and_goes_on_where_it_stopped(
     tmp_path: Path, pretrained: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     skip_without_opengl()
-    config = config_for(tmp_path, pretrained, episode_s=0.6, seed=3)
+    config = config_for(tmp_path, pretrained, episode_s=0.6, seed=3, device="auto")
     deploy(config)
     with pytest.raises(ConfigError, match="add --resume"):
         deploy(config)
@@ -334,7 +339,8 @@ def test_a_policy_on_the_twin_is_recorded_judged_and_goes_on_where_it_stopped(
     assert all(entry["outcome"] == "timeout" and not entry["success"] for entry in entries)
     out = capsys.readouterr().out
     assert "success, by the twin's referee: 0 [0, 0.658] of 2 episodes" in out
-    assert (config.output_dir / "episode_0000.mp4").exists()
+    names = {path.name for path in config.output_dir.iterdir()}
+    assert {"episode_0000.mp4", "session_0000.svg", "session_0001.svg"} <= names
     with McapLog(config.output_dir / "session_0000.mcap") as log:
         assert log.indexed and not log.problems
         assert log.stats()["/action"].count == 15
@@ -352,8 +358,10 @@ def begun(tmp_path: Path, policy: Path | None, results: str, **options: object) 
 
 def test_other_episodes_are_not_added_to_those_there_are(tmp_path: Path, pretrained: Path) -> None:
     config = begun(tmp_path, pretrained, "{}\n", seed=3)
-    with pytest.raises(ConfigError, match=r"was begun with another --control, --seed; give the"):
-        deploy(replace(config, control="script", seed=77))
+    with pytest.raises(
+        ConfigError, match=r"was begun with another --seed, --control, --look; give the"
+    ):
+        deploy(replace(config, control="script", seed=77, look=False))
 
 
 def test_an_episode_that_was_cut_off_is_done_again_and_its_recording_kept(

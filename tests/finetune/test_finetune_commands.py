@@ -8,6 +8,8 @@ import sys
 import pytest
 
 from eisp_data.config import load_yaml
+from eisp_data.errors import ConfigError
+from eisp_data.sim import render
 from finetune.cli import evaluate, finetune
 from finetune.config import FinetuneConfig
 
@@ -38,9 +40,12 @@ def test_a_policy_is_fine_tuned_resumed_and_evaluated(pretrained, tmp_path, monk
     run(monkeypatch, finetune, "--policy.path", pretrained, "--output-dir", folder, *SMALL)
     said = capsys.readouterr().out
     assert "success before" in said and f"policy: {folder / 'best'}" in said
-    run(monkeypatch, finetune, "--output-dir", folder, "--resume", "--online.rounds", "2")
-    assert "rounds: 2" in (folder / "finetune.yaml").read_text()
-    assert "worlds: 2" in (folder / "finetune.yaml").read_text()
+    more = ["--online.rounds", "2", "--online.updates", "1"]
+    run(monkeypatch, finetune, "--output_dir", folder, "--resume", *more)
+    saved = load_yaml(FinetuneConfig, folder / "finetune.yaml")
+    assert (saved.online.rounds, saved.online.worlds, saved.resume) == (2, 2, False)
+    lines = (json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines())
+    assert [each["updates"] for each in lines if each["stage"] == "finetune"] == [0, 2, 3]
     capsys.readouterr()
     words = ["--policy.path", folder, "--episodes", "2", "--device", "cpu", "--threads", "1"]
     run(monkeypatch, evaluate, *words, "--json")
@@ -54,6 +59,21 @@ def test_a_policy_is_fine_tuned_resumed_and_evaluated(pretrained, tmp_path, monk
     table = capsys.readouterr().out
     assert table.startswith("stack: 2 episodes from seed 1000")
     assert all(row in table for row in ("success at the last step", "relative to the oracle"))
+
+
+def test_the_figures_are_not_lost_where_there_is_no_opengl(
+    pretrained, tmp_path, monkeypatch, capsys
+):
+    def no_opengl(width: int, height: int) -> None:
+        raise ConfigError("cannot render")
+
+    monkeypatch.setattr(render, "open_gl", no_opengl)
+    words = ["--policy.path", pretrained, "--episodes", "1", "--device", "cpu", "--json"]
+    run(monkeypatch, evaluate, *words, "--video", tmp_path / "film.mp4")
+    said = capsys.readouterr()
+    assert json.loads(said.out)["episodes"] == 1
+    assert said.err == "no film: cannot render\n"
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_without_a_policy_it_learns_fast_and_explores(tmp_path, monkeypatch):

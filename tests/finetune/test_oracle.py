@@ -31,7 +31,7 @@ def test_an_oracles_subgoal_is_one_move_ahead_and_leaves_the_world_as_it_is(task
     worlds = Worlds(TASKS[task], WORLDS)
     worlds.reset(range(WORLDS))
     before = worlds.state.copy()
-    policy = subgoal_policy(oracle_led(task), worlds, "cpu")
+    policy = subgoal_policy(oracle_led(task), worlds)
     assert isinstance(policy, OracleSubgoals)
     policy.act(worlds.observation, worlds.achieved_goal, worlds.desired_goal)
     np.testing.assert_array_equal(worlds.state, before)
@@ -42,7 +42,7 @@ def test_an_oracles_subgoal_is_one_move_ahead_and_leaves_the_world_as_it_is(task
 def test_stacks_first_subgoal_brings_one_block_to_its_goal_or_out_of_the_way():
     worlds = Worlds(TASKS["stack"], WORLDS)
     worlds.reset(range(WORLDS))
-    policy = OracleSubgoals(oracle_led("stack"), worlds, "cpu")
+    policy = OracleSubgoals(oracle_led("stack"), worlds)
     policy.act(worlds.observation, worlds.achieved_goal, worlds.desired_goal)
     moved = np.linalg.norm((policy.subgoal - worlds.achieved_goal).reshape(WORLDS, 3, 3), axis=2)
     assert ((moved > 0.02).sum(axis=1) == 1).all()
@@ -51,10 +51,10 @@ def test_stacks_first_subgoal_brings_one_block_to_its_goal_or_out_of_the_way():
 def test_an_environment_without_a_script_has_no_oracle():
     agent = linear_agent(subgoals=replace(SubgoalConfig(), source="oracle"))
     with pytest.raises(ConfigError, match=r"has no scripted policy, .*; choose generator"):
-        subgoal_policy(agent, GymWorlds("line_env:PushedLine-v0", 1), "cpu")
+        subgoal_policy(agent, GymWorlds("line_env:PushedLine-v0", 1))
 
 
 def test_other_sources_need_no_worlds():
     agent = linear_agent()
-    policy = subgoal_policy(agent, GymWorlds("line_env:PushedLine-v0", 1), "cpu")
+    policy = subgoal_policy(agent, GymWorlds("line_env:PushedLine-v0", 1))
     assert type(policy) is SubgoalPolicy

@@ -90,6 +90,20 @@ def test_only_the_newest_two_are_kept(tmp_path, steps, kept):
     assert training.restore(tmp_path)[0] == steps[-1]
 
 
+@pytest.mark.parametrize("followed", [False, True])
+def test_a_run_goes_on_where_a_copy_has_lost_its_link_or_made_a_folder_of_it(tmp_path, followed):
+    training, run = Training(), tmp_path / "copy"
+    for step in (1, 2):
+        training.save(tmp_path / "run", step)
+    shutil.copytree(tmp_path / "run", run)  # follows the link
+    if not followed:
+        shutil.rmtree(run / "checkpoints/last")
+    assert runs.exists(run) and training.restore(run)[0] == 2
+    training.save(run, 3)
+    assert steps_of(run) == ["000002", "000003", "last"]
+    assert (run / "checkpoints/last").resolve().name == "000003"
+
+
 def test_nothing_is_pickled(tmp_path):
     Training().save(tmp_path, 1)
     files = {p.name for p in (tmp_path / "checkpoints/000001").rglob("*") if p.is_file()}
@@ -160,7 +174,7 @@ def test_a_damaged_state_is_told_in_one_line(tmp_path, name, how):
     path.unlink()
     if how != "missing":
         path.write_bytes(content[: len(content) // 2] if how == "truncated" else b"")
-    with pytest.raises(DataError, match="last cannot be resumed from: ") as caught:
+    with pytest.raises(DataError, match="000004 cannot be resumed from: ") as caught:
         training.restore(tmp_path)
     assert "\n" not in str(caught.value)
 
@@ -174,7 +188,7 @@ def test_a_checkpoint_of_an_agent_with_other_settings_is_told_in_one_line(tmp_pa
 
 def test_a_run_without_a_checkpoint_says_so(tmp_path):
     assert not runs.exists(tmp_path)
-    with pytest.raises(DataError, match="holds no policy"):
+    with pytest.raises(DataError, match="holds no checkpoint"):
         Training().restore(tmp_path)
 
 

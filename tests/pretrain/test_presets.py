@@ -84,6 +84,10 @@ def test_another_environment_gets_what_needs_no_objects_and_no_rest():
         ({"validation_share": float("nan")}, "--validation-share"),
         ({"gamma": 1.0}, "--agent.sac.gamma must be at least 0 and below 1; got 1.0"),
         ({"mix": GoalMix(0.5, 0.5, 0.5)}, "--agent.mix: .* add up to 1; got 0.5, 0.5, 0.5"),
+        (
+            {"mix": GoalMix(0.3333333, 0.3333333, 0.3333333)},
+            "--agent.mix: .* add up to 1; got 0.333",
+        ),
         ({"mix": GoalMix(1.5, -0.5, 0.0)}, "--agent.mix: .* add up to 1; got 1.5, -0.5, 0.0"),
         ({"waypoints": 0}, "--agent.waypoints must be at least 1; got 0"),
         ({"candidates": 0}, "--agent.subgoals.candidates must be at least 1; got 0"),
