@@ -226,14 +226,16 @@ def _refuse_failed(path: Path, checks: Sequence[Check]) -> None:
 
 
 def _files(folder: Path) -> list[Path]:
-    """Return the files under a folder but hidden ones and links, in order."""
-    return sorted(
-        path
-        for path in folder.rglob("*")
-        if path.is_file()
-        and not path.is_symlink()
-        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
-    )
+    """Return the files under a folder but hidden ones, in order; DataError if one is a link."""
+    files = []
+    for path in [folder, *sorted(folder.rglob("*"))]:
+        if any(part.startswith(".") for part in path.relative_to(folder).parts):
+            continue
+        if path.is_symlink():  # what it leads to may be outside, and may be private
+            raise DataError(f"{path}: a link; push a copy that has the files themselves (cp -rL)")
+        if path.is_file():
+            files.append(path)
+    return files
 
 
 @contextmanager

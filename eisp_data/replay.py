@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from eisp_data.episode import Episode
 from eisp_data.errors import ConfigError, DataError
 from eisp_data.sim.pixels import Pixels
 from eisp_data.sim.worlds import Worlds
+from eisp_data.storage.episodes import read_index
 from eisp_data.storage.lerobot import DatasetWriter, read_episodes, read_recipe, read_spec
 from eisp_data.tasks.base import Task
 from eisp_data.tasks.registry import get_task
@@ -50,13 +52,15 @@ def chosen_episodes(
     root: Path, numbers: Sequence[int], images: bool = False
 ) -> Iterator[tuple[int, Episode]]:
     """Yield number and episode of the named ones, or of all; DataError for a number not there."""
-    wanted, found = set(numbers), -1
-    for found, episode in enumerate(read_episodes(root, images=images)):
-        if not numbers or found in wanted:
-            yield found, episode
-    missing = sorted(number for number in wanted if not 0 <= number <= found)
+    last = len(read_index(root)) - 1
+    wanted = set(numbers) or set(range(last + 1))
+    missing = sorted(number for number in wanted if not 0 <= number <= last)
     if missing:
-        raise DataError(f"{root}: no episode {missing[0]}; there are 0 to {found}")
+        raise DataError(f"{root}: no episode {missing[0]}; there are 0 to {last}")
+    episodes = islice(read_episodes(root, images=images), max(wanted, default=-1) + 1)
+    for number, episode in enumerate(episodes):
+        if number in wanted:
+            yield number, episode
 
 
 def replay(root: Path, numbers: Sequence[int] = ()) -> Iterator[Deviation]:

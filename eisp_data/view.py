@@ -70,6 +70,7 @@ def preview_png(root: Path) -> bytes:
     """Return a storyboard of the first episode; without a simulator, what the data itself show."""
     spec = read_spec(root)
     try:
+        task_of(spec.task, spec.sim_state_dim)
         [(_, episode)] = chosen_episodes(root, [0])
         frames = draw(spec, episode, story_rows(len(episode) + 1))
     except EispError:  # a real robot, an unknown task, or no OpenGL here
@@ -99,14 +100,13 @@ def view(
         _need_rerun()
     spec = read_spec(root)
     simulated = spec.sim_state_dim > 0
+    name = camera or ("front" if simulated else next(iter(spec.cameras), ""))
+    if not simulated and not spec.cameras:
+        raise DataError(f"{root}: has neither simulator states nor camera images to draw")
+    if not simulated and name not in spec.cameras:
+        raise DataError(f"{root}: no camera {name!r}; there are {sorted(spec.cameras)}")
     [(_, episode)] = chosen_episodes(root, [number], images=not simulated)
-    if simulated:
-        frames = draw(spec, episode, camera=camera or "front")
-    else:
-        name = camera or next(iter(spec.cameras), "")
-        if name not in episode.images:
-            raise DataError(f"{root}: no camera {name!r}; there are {sorted(spec.cameras)}")
-        frames = episode.images[name]
+    frames = draw(spec, episode, camera=name) if simulated else episode.images[name]
     to.mkdir(parents=True, exist_ok=True)
     stem = to / f"episode-{number}"
     written = [stem.with_suffix(".png"), stem.with_suffix(".mp4")]
@@ -118,20 +118,20 @@ def view(
     return written
 
 
-def story_rows(length: int, count: int = STORY_FRAMES) -> list[int]:
-    """Return ``count`` rows of ``length``, evenly spaced, the first and the last among them."""
-    return [int(row) for row in np.linspace(0, length - 1, count).round()]
+def story_rows(length: int) -> list[int]:
+    """Return STORY_FRAMES rows of ``length``, evenly spaced, the first and the last among them."""
+    return [int(row) for row in np.linspace(0, length - 1, STORY_FRAMES).round()]
 
 
-def storyboard(frames: np.ndarray, count: int = STORY_FRAMES) -> np.ndarray:
+def storyboard(frames: np.ndarray) -> np.ndarray:
     """Return some (T, H, W, 3) frames, evenly spaced, in two rows of one picture.
 
     Frames of a small camera are enlarged, each pixel to a square.
     """
     larger = max(1, LEAST_HEIGHT // frames.shape[1])
-    chosen = frames[story_rows(len(frames), count)].repeat(larger, axis=1).repeat(larger, axis=2)
+    chosen = frames[story_rows(len(frames))].repeat(larger, axis=1).repeat(larger, axis=2)
     _, height, width, _ = chosen.shape
-    across = -(-count // 2)
+    across = -(-STORY_FRAMES // 2)
     size = (2 * (height + MARGIN) - MARGIN, across * (width + MARGIN) - MARGIN, 3)
     page = np.full(size, 255, np.uint8)
     for place, frame in enumerate(chosen):

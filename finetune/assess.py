@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 
+from eisp_data.cli.collect import SEEDS_APART
 from eisp_data.config import at_least, check_seed
 from eisp_data.errors import ConfigError
 from eisp_data.storage.files import check_writable
@@ -25,6 +26,11 @@ def assess(config: EvaluateConfig) -> Evaluation:
     """Evaluate a policy, and film its first episode if asked to and if this machine can."""
     at_least(1, {"--episodes": config.episodes, "--threads": config.threads})
     check_seed(config.seed)
+    if config.seed + config.episodes > SEEDS_APART:
+        raise ConfigError(
+            f"--seed: episodes from {SEEDS_APART} on are learned from; got {config.seed} and "
+            f"{config.episodes} episodes"
+        )
     check_subgoals(config.subgoals, "--subgoals")
     device = set_up(config.device, config.threads)
     agent = load_for_rollouts(config.policy.path, config.subgoals, device)

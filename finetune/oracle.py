@@ -30,7 +30,7 @@ class OracleSubgoals(SubgoalPolicy):
 
     def __init__(self, agent: Agent, worlds: AnyWorlds) -> None:
         super().__init__(agent, worlds.count)
-        if not isinstance(worlds, Worlds) or agent.vision:
+        if not isinstance(worlds, Worlds) or worlds.name not in SCRIPTS or agent.vision:
             raise ConfigError(
                 f"--subgoals.source oracle: {worlds.name} has no scripted policy, or none that "
                 "sees images; choose generator, random or none"

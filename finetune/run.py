@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from eisp_data.cli.collect import episode_seeds
+from eisp_data.cli.collect import LAST_SEED, episode_seeds
 from eisp_data.collect import explore
 from eisp_data.config import above_zero, at_least, check_seed, load_yaml, zero_to_one
 from eisp_data.errors import ConfigError
@@ -146,7 +146,14 @@ def load_for_rollouts(path: Path | None, subgoals: SubgoalConfig, device: str) -
 
 def _dataset(config: FinetuneConfig, agent: Agent) -> Trajectories:
     """Return all episodes of the dataset that the agent was pretrained on."""
-    root = config.dataset.root or _pretraining_dataset(config.policy.path)
+    root = config.dataset.root
+    if root is None:
+        root = _pretraining_dataset(config.policy.path)
+        if not root.exists():
+            raise ConfigError(
+                f"{config.policy.path} was pretrained on {root}, which is not there; give "
+                "--dataset.root"
+            )
     arrays = load_seen(root, agent.config, agent.vision)
     every = np.arange(arrays.num_episodes)
     return gather(arrays, every, agent.layout, agent.config.waypoints)
@@ -171,6 +178,8 @@ def _keep_history(policy: Path, run: Path) -> None:
 
 def _from_nothing(env_id: str, seed: int) -> tuple[Agent, Trajectories]:
     """Return a fresh agent for an environment, and episodes of random actions in it."""
+    if seed > LAST_SEED:
+        raise ConfigError(f"--seed must be 0 to {LAST_SEED} without a policy; got {seed}")
     worlds = GymWorlds(env_id, 1)
     layout = Layout(worlds.observation_dim, worlds.goal_dim, worlds.action_dim)
     config = preset("cpu", env_id, Path(), Path()).agent

@@ -40,7 +40,7 @@ def _start(words: list[str]) -> tuple[list[str], PretrainConfig | None]:
     saved = saved_run(words, PretrainConfig, "pretrain.yaml")
     if saved or given(words, "--config"):
         if name is not None:
-            raise ConfigError("--preset: with --resume and --config all settings are of a file")
+            raise ConfigError("--preset: with --resume or --config all settings come from the file")
         return words, saved
     known = cast(PresetName, preset_name(name, get_args(PresetName)))
     _, root = take(words, "--dataset.root")

@@ -85,7 +85,7 @@ def _start(words: list[str]) -> tuple[list[str], VqVaeTrainConfig | None]:
     resumed = saved_run(words, VqVaeTrainConfig, "vqvae.yaml")
     if resumed or given(words, "--config"):
         if name is not None:
-            raise ConfigError("--preset: with --resume and --config all settings are of a file")
+            raise ConfigError("--preset: with --resume or --config all settings come from the file")
         return words, resumed
     known = cast(PresetName, preset_name(name, get_args(PresetName)))
     _, root = take(words, "--dataset.root")

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from eisp_data.cli.run import run
-from eisp_data.config import at_least
-from eisp_data.errors import ConfigError
+from eisp_data.cli.run import fail, run
+from eisp_data.cli.words import given, take
+from eisp_data.config import at_least, load_yaml
+from eisp_data.errors import ConfigError, EispError
 
 if TYPE_CHECKING:
     from eisp_data.episode import Episode
@@ -19,8 +21,10 @@ if TYPE_CHECKING:
 
 _BATCH = 50
 """Episodes that are written at a time, and so the most that a kill loses."""
-_SEEDS_APART = 1_000_000
-_LAST_SEED = 498
+SEEDS_APART = 1_000_000
+"""How many seeds each dataset has; the first as many are left to evaluations."""
+LAST_SEED = 498
+"""Datasets' seeds end where those of learning online begin, see ``finetune.train``."""
 CONFIG_FILE = "meta/collect.yaml"
 """In the dataset; give it back with ``--config`` and another ``--output-dir``."""
 _NOT_OF_THE_DATA = ("output_dir", "resume")
@@ -64,7 +68,21 @@ class CollectConfig:
 
 def main() -> None:
     """Run ``eisp-collect``."""
-    run(collect, prog="eisp-collect", config_file=True)
+    words = sys.argv[1:]
+    try:
+        default = _resumed(words)
+    except EispError as error:
+        fail(str(error))
+    run(collect, words, "eisp-collect", config_file=True, default=default)
+
+
+def _resumed(words: Sequence[str]) -> CollectConfig | None:
+    """Return the settings that the dataset to go on with was begun with."""
+    _, folder = take(words, "--output-dir")
+    if not given(words, "--resume") or folder is None or not (Path(folder) / CONFIG_FILE).exists():
+        return None
+    # All but the folder has been saved.
+    return load_yaml(CollectConfig, Path(folder) / CONFIG_FILE, absent=Path(folder))
 
 
 def collect(config: CollectConfig) -> None:
@@ -98,7 +116,7 @@ def episode_seeds(seed: int, start: int, stop: int) -> range:
 
     Those below 1,000,000 are left to evaluations, whose episodes must not have been learned from.
     """
-    first = (seed + 1) * _SEEDS_APART
+    first = (seed + 1) * SEEDS_APART
     return range(first + start, first + stop)
 
 
@@ -108,7 +126,7 @@ def missing_seeds(seed: int, present: Sequence[int], episodes: int) -> list[int]
     Seeds 0, 1, 4 and 5 present and 7 episodes wanted: 2, 3 and 6.
     """
     here = set(present)
-    lacking = (s for s in episode_seeds(seed, 0, _SEEDS_APART) if s not in here)
+    lacking = (s for s in episode_seeds(seed, 0, SEEDS_APART) if s not in here)
     return list(islice(lacking, max(0, episodes - len(present))))
 
 
@@ -117,10 +135,10 @@ def _check(config: CollectConfig) -> None:
         raise ConfigError("give one of --task and --env.id")
     if config.env.id is not None and config.policy not in (None, "random"):
         raise ConfigError(f"--policy {config.policy} needs --task; with --env.id it is random")
-    if not 1 <= config.episodes <= _SEEDS_APART:
-        raise ConfigError(f"--episodes must be 1 to {_SEEDS_APART}; got {config.episodes}")
-    if not 0 <= config.seed <= _LAST_SEED:
-        raise ConfigError(f"--seed must be 0 to {_LAST_SEED}; got {config.seed}")
+    if not 1 <= config.episodes <= SEEDS_APART:
+        raise ConfigError(f"--episodes must be 1 to {SEEDS_APART}; got {config.episodes}")
+    if not 0 <= config.seed <= LAST_SEED:
+        raise ConfigError(f"--seed must be 0 to {LAST_SEED}; got {config.seed}")
     at_least(1, {"--workers": config.workers, "--worlds": config.worlds})
     if config.resume and not (config.output_dir / "meta/info.json").exists():
         raise ConfigError(f"--resume: {config.output_dir} holds no dataset")
@@ -149,6 +167,8 @@ class _TaskSource:
             self.spec = replace(self.spec, cameras={CAMERA: IMAGE_SIZE})
         self.recipe: dict[str, Any] = {}
         if self.policy != "random":
+            if self._task.name not in SCRIPTS:
+                raise ConfigError(f"{self._task.name} has no script; give --policy random")
             self._script = SCRIPTS[self._task.name]
             oracle = self.policy == "oracle"
             self._noise = Noise() if oracle else DEMONSTRATOR[self._task.name]

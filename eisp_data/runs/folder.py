@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -53,10 +53,19 @@ def check_same_dataset(begun: Path, given: Path, file: Path) -> None:
 def begin_run(run: Path, config: Any, name: str) -> None:
     """Make the folder of a run and write its configuration, once all input has proved usable.
 
-    Not whether it was resumed: given back with ``--config`` it begins a run of its own.
+    Given back with ``--config``, from anywhere, it begins a run of its own on the same data: paths
+    are saved as absolute ones, and not whether the run was resumed.
     """
     try:
         run.mkdir(parents=True, exist_ok=True)
-        save_yaml(replace(config, resume=False), run / name)
+        save_yaml(_absolute(replace(config, resume=False)), run / name)
     except OSError as error:
         raise ConfigError(f"cannot write to {run}: {error.strerror}") from None
+
+
+def _absolute(value: Any) -> Any:
+    """Return a configuration with its paths made absolute."""
+    if is_dataclass(value) and not isinstance(value, type):
+        changed = {one.name: _absolute(getattr(value, one.name)) for one in fields(value)}
+        return replace(value, **changed)
+    return value.absolute() if isinstance(value, Path) else value

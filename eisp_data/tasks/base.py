@@ -6,9 +6,8 @@ A task is stateless. All its methods are vectorised over the N worlds of a batch
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import mujoco
 import numpy as np
@@ -50,15 +49,12 @@ class ObjectSlot:
     """Its position in the goal."""
 
 
-def compute_reward(
-    achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Mapping[str, Any] | None = None
-) -> np.ndarray:
+def compute_reward(achieved_goal: np.ndarray, desired_goal: np.ndarray) -> np.ndarray:
     """Return the paper's Eq. (1): 0 where the norm of the goal error is at most 5 cm, else -1.
 
     Args:
         achieved_goal: (..., G) metres.
         desired_goal: (..., G) metres.
-        info: not used; Gymnasium's ``GoalEnv`` passes it.
 
     Returns:
         (...) float32.

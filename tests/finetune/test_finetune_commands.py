@@ -4,14 +4,16 @@ import json
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 
-from eisp_data.config import load_yaml
+from eisp_data.config import load_yaml, save_yaml
 from eisp_data.errors import ConfigError
 from eisp_data.sim import render
 from finetune.cli import evaluate, finetune
 from finetune.config import FinetuneConfig
+from pretrain.config import PretrainConfig
 
 SMALL = [
     "--online.rounds", "1", "--online.worlds", "2", "--online.updates", "2",
@@ -94,6 +96,8 @@ def test_without_a_policy_it_learns_fast_and_explores(tmp_path, monkeypatch):
         (finetune, ["--policy.path", "RUN", "--subgoals.source", "magic"], "magic"),
         (finetune, ["--policy.path", "RUN", "--online.worlds", "0"], "must be at least 1; got 0"),
         (finetune, ["--resume"], "--resume: give --output-dir"),
+        (finetune, ["--env.id", "FetchReach-v4", "--seed", "499"], "must be 0 to 498 without a"),
+        (evaluate, ["--policy.path", "RUN", "--seed", "999999"], "from 1000000 on are learned"),
         (evaluate, [], "missing --policy.path"),
         (evaluate, ["--policy.path", "nowhere"], "nowhere holds no policy"),
         (evaluate, ["--policy.path", "RUN", "--episodes", "0"], "--episodes must be at least 1"),
@@ -114,6 +118,16 @@ def test_mistakes_are_told_in_one_line(
     words = [str(pretrained) if word == "RUN" else word for word in words]
     assert said in mistake(monkeypatch, capsys, command, *words)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_dataset_that_has_moved_is_asked_for(pretrained, tmp_path, monkeypatch, capsys):
+    run_of = shutil.copytree(pretrained, tmp_path / "run", symlinks=True)
+    config = load_yaml(PretrainConfig, run_of / "pretrain.yaml")
+    assert config.dataset.root.is_absolute()
+    moved = replace(config, dataset=replace(config.dataset, root=tmp_path / "moved"))
+    save_yaml(moved, run_of / "pretrain.yaml")
+    said = mistake(monkeypatch, capsys, finetune, "--policy.path", run_of, *SMALL)
+    assert f"was pretrained on {tmp_path / 'moved'}, which is not there; give --data" in said
 
 
 def test_a_policy_of_recordings_is_not_taken_for_an_environments(

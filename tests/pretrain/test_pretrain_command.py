@@ -53,7 +53,7 @@ def test_a_policy_is_made_and_its_place_said(stack_dataset, tmp_path, monkeypatc
         (["--dataset.root", "DATA", "--updates", "many"], "many"),
         (["--dataset.root", "DATA", "--updates", "-1"], "--updates must be at least 1; got -1"),
         (["--dataset.root", "DATA", "--agent.task", "push4"], "a dataset of 'stack', not of"),
-        (["--config", "mine.yaml", "--preset", "paper"], "--preset: with --resume and --config"),
+        (["--config", "mine.yaml", "--preset", "paper"], "--preset: with --resume or --config"),
         (["--resume"], "--resume: give --output-dir"),
         (["--resume", "--output-dir", "nowhere"], "nowhere holds no run"),
     ],

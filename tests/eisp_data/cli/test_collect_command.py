@@ -13,10 +13,12 @@ from eisp_data.cli.collect import (
     EnvConfig,
     collect,
     episode_seeds,
+    main,
     missing_seeds,
 )
 from eisp_data.cli.parse import parse
 from eisp_data.errors import ConfigError
+from eisp_data.policies.registry import SCRIPTS
 from eisp_data.storage.episodes import read_index
 from eisp_data.storage.lerobot import read_episodes, read_recipe, read_spec
 from eisp_data.storage.merge import merge
@@ -58,6 +60,24 @@ def test_a_resumed_dataset_is_the_one_that_was_never_interrupted(stack, tmp_path
     assert_same(stack.output_dir, tmp_path / "data")
     assert not configured_again(tmp_path / "data", tmp_path / "other").resume
     assert "4 episodes" in capsys.readouterr().out
+
+
+def test_resume_goes_on_with_the_settings_that_were_saved(stack, tmp_path, monkeypatch):
+    root = tmp_path / "data"
+    collect(replace(stack, output_dir=root, episodes=1))
+    monkeypatch.setattr(sys, "argv", ["eisp-collect", "--output-dir", str(root), "--resume"])
+    main()
+    assert configured_again(root, root) == replace(stack, output_dir=root, episodes=1)
+    monkeypatch.setattr(sys, "argv", [*sys.argv, "--episodes", "2"])
+    main()
+    assert len(read_index(root)) == 2
+    assert configured_again(root, root) == replace(stack, output_dir=root, episodes=2)
+
+
+def test_a_task_without_a_script_says_so(tmp_path, monkeypatch):
+    monkeypatch.delitem(SCRIPTS, "stack")
+    with pytest.raises(ConfigError, match="stack has no script; give --policy random"):
+        collect(CollectConfig(tmp_path / "data", "stack"))
 
 
 def test_resume_collects_what_a_repair_had_lost_and_no_episode_twice(stack, tmp_path):

@@ -14,7 +14,8 @@ from storage_samples import assert_same
 
 from eisp_data.cli.data import COMMANDS
 from eisp_data.episode import Episode
-from eisp_data.errors import ConfigError
+from eisp_data.errors import ConfigError, DataError
+from eisp_data.replay import chosen_episodes
 from eisp_data.sim.worlds import Worlds
 from eisp_data.storage.cache import load_arrays
 from eisp_data.storage.lerobot import DatasetSpec, DatasetWriter, read_episodes
@@ -215,6 +216,33 @@ def test_view_shows_the_camera_of_a_real_robot(eisp_data, make_dataset, tmp_path
     root, _ = make_dataset(cameras=True, sim_state_dim=0)
     assert eisp_data("view", root, "--to", tmp_path / "look")[0] == 0
     assert (tmp_path / "look/episode-0.mp4").stat().st_size > 0
+
+
+@pytest.mark.parametrize(
+    ("cameras", "words", "said"),
+    [
+        (False, (), "has neither simulator states nor camera images to draw"),
+        (True, ("--camera", "left"), "no camera 'left'; there are ["),
+    ],
+)
+def test_view_of_what_cannot_be_drawn_is_told_before_it_is_read(
+    eisp_data, make_dataset, monkeypatch, cameras, words, said
+):
+    root, _ = make_dataset(cameras=cameras, sim_state_dim=0)
+    monkeypatch.setattr("eisp_data.replay.read_episodes", None)
+    status, _, err = eisp_data("view", root, *words)
+    assert status == 2 and said in err
+
+
+def test_one_episode_is_shown_without_reading_those_after_it(simulated, monkeypatch):
+    root, episodes = simulated
+
+    def first_only(root, images):
+        yield episodes[0]
+        raise DataError("the next one is damaged")
+
+    monkeypatch.setattr("eisp_data.replay.read_episodes", first_only)
+    assert [number for number, _ in chosen_episodes(root, [0])] == [0]
 
 
 def test_the_subgoal_is_the_end_of_the_part_that_a_step_is_in():

@@ -118,6 +118,17 @@ def test_a_dataset_that_fails_a_check_is_not_sent(make_dataset, server):
     assert not server.repos
 
 
+@pytest.mark.parametrize("what", ["data", "data/chunk-000"])
+def test_links_are_refused_instead_of_sending_a_dataset_without_them(
+    make_dataset, server, tmp_path, what
+):
+    root, _ = make_dataset()
+    (root / what).rename(tmp_path / "elsewhere")
+    (root / what).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(DataError, match=r": a link; push a copy"):
+        hub.plan_push(root, REPO)
+
+
 def test_a_cut_upload_goes_on_where_it_stopped(make_dataset, server):
     root, _ = make_dataset(cameras=True)
     plan = hub.plan_push(root, REPO)
