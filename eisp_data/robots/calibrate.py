@@ -71,7 +71,8 @@ def calibrate_cell(
         "board_error_mm": round(1000 * found.board_error_m, 3),
         "images": float(len(seen)),
     }
-    return Calibration(robot.name, {camera: placed}, task, quality=quality)
+    tool = get_arm(robot.arm).transform_tool_to_tip
+    return Calibration(robot.name, {camera: placed}, task, tool, quality)
 
 
 def _postures(robot: Robot, count: int, seed: int) -> Iterator[np.ndarray]:

@@ -11,10 +11,12 @@ import numpy as np
 from eisp_data.config import load_yaml, save_yaml
 from eisp_data.errors import ConfigError
 from eisp_data.robots import cell
+from eisp_data.robots.arms import get_arm
 from eisp_data.robots.robot import CameraIntrinsics, Robot
 
 _ORTHONORMAL = 1e-4
 """How far a rotation in a file may be from one: its entries are written with nine digits."""
+_SAME_TOOL = 1e-6
 
 
 @dataclass(frozen=True)
@@ -33,8 +35,9 @@ class Calibration:
     robot: str
     """A name in the registry."""
     cameras: dict[str, CameraCalibration]
-    transform_task_to_base: np.ndarray = field(default_factory=cell.transform_task_to_base)
-    transform_tool_to_flange: np.ndarray = field(default_factory=cell.transform_tool_to_flange)
+    transform_task_to_base: np.ndarray
+    transform_tool_to_flange: np.ndarray
+    """The arm's own: what moves the arm knows no other."""
     quality: dict[str, float] = field(default_factory=dict)
     """What the calibration said about its own accuracy; for people to read."""
 
@@ -54,6 +57,12 @@ class Calibration:
         """Raise ConfigError where this cannot be the calibration of that robot's cell."""
         if self.robot != robot.name:
             raise ConfigError(f"the calibration is of robot {self.robot!r}, not of {robot.name!r}")
+        found, tool = self.transform_tool_to_flange, get_arm(robot.arm).transform_tool_to_tip
+        if not np.allclose(found, tool, rtol=0, atol=_SAME_TOOL):
+            raise ConfigError(
+                f"the calibration's transform_tool_to_flange is {_listed(found)}, "
+                f"but that of {robot.arm} is {_listed(tool)}"
+            )
         for name, camera in robot.cameras.items():
             if name not in self.cameras:
                 known = ", ".join(self.cameras) or "none"
@@ -68,8 +77,15 @@ class Calibration:
 
 def designed(robot: str, camera: str, intrinsics: CameraIntrinsics) -> Calibration:
     """Return the calibration of a cell that stands exactly as it was designed."""
-    transform_camera_to_base = cell.transform_task_to_base() @ cell.transform_camera_to_task()
-    return Calibration(robot, {camera: CameraCalibration(intrinsics, transform_camera_to_base)})
+    task, tool = cell.transform_task_to_base(), cell.transform_tool_to_flange()
+    placed = CameraCalibration(intrinsics, task @ cell.transform_camera_to_task())
+    return Calibration(robot, {camera: placed}, task, tool)
+
+
+def usual(robot: Robot) -> Calibration:
+    """Return what holds without a file: no camera, and the table at the arm's usual place."""
+    arm = get_arm(robot.arm)
+    return Calibration(robot.name, {}, arm.transform_task_to_base, arm.transform_tool_to_tip)
 
 
 def load_calibration(path: Path) -> Calibration:

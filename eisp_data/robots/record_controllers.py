@@ -57,6 +57,10 @@ class Human:
         """Take the fingers as they are."""
         self._fingers = opening_action(seen.estimates.tool.opening_m)
 
+    def go_on_from(self, fingers: float) -> None:
+        """Start from the last command to the fingers; where they are would not squeeze."""
+        self._fingers = fingers
+
     def act(self, seen: Seen) -> Decision:
         """Return what the hands say; RobotError if the device is gone."""
         return self.decide()[0]
@@ -89,7 +93,7 @@ class Script:
 class Watched:
     """A controller that a human may take over from at any moment."""
 
-    def __init__(self, inner: Controller, human: Human) -> None:
+    def __init__(self, inner: Slowed, human: Human) -> None:
         self.name = inner.name
         self._inner, self._human = inner, human
 
@@ -102,8 +106,11 @@ class Watched:
         """Return the human's decision while the controls are held, else the other's."""
         hands, takes_over = self._human.decide()
         if takes_over:
+            self._inner.interrupt()
             return replace(hands, by_human=True)
         decision = self._inner.act(seen)
+        # A look ends with open fingers.
+        self._human.go_on_from(1.0 if decision.looking else float(decision.action[3]))
         return replace(decision, outcome=hands.outcome or decision.outcome)
 
 
@@ -136,6 +143,10 @@ class Slowed:
         # After a look it decides anew.
         self._step = 0 if self._decision.looking else self._step + 1
         return self._decision
+
+    def interrupt(self) -> None:
+        """Decide anew at the next tick: somebody else moves the arm."""
+        self._step = 0
 
     def _stretched(self, seen: Seen) -> Seen:
         state = seen.state.copy()

@@ -34,22 +34,17 @@ class RobotiqGripper:
         self._lock = threading.Lock()
         self._closing = threading.Event()
         self._position = self._target = 0
+        self._active = False
         self._fault: str | None = None
 
     def connect(self) -> None:
-        """Connect, and activate it if it is not.
-
-        Raises:
-            RobotError: nothing answers, or it does not become active.
-        """
+        """Connect; RobotError if nothing answers. The fingers stay where they are."""
         try:
             self._socket = socket.create_connection((self._host, PORT), timeout=_TIMEOUT_S)
         except OSError as error:
             reason = error.strerror or error
             raise RobotError(f"no gripper at {self._host}:{PORT}: {reason}") from None
-        if self._get("STA") != _ACTIVE:
-            self._set("ACT 1")
-            self._await("STA", _ACTIVE, _ACTIVATION_S)
+        self._active = self._get("STA") == _ACTIVE
         self._position = self._target = self._get("POS")
         self._fault = None
         self._closing.clear()
@@ -57,7 +52,11 @@ class RobotiqGripper:
         self._thread.start()
 
     def calibrate(self) -> None:
-        """Open and close it once to find the ends of its range."""
+        """Activate it if it is not, and open and close it once to find the ends of its range."""
+        if not self._active:
+            self._set("ACT 1")
+            self._await("STA", _ACTIVE, _ACTIVATION_S)
+            self._active = True
         self._open_at = self._move_and_wait(0)
         self._closed_at = self._move_and_wait(255)
         if self._closed_at - self._open_at < 20:
@@ -74,7 +73,16 @@ class RobotiqGripper:
         return self._to_m(self._position)
 
     def move(self, opening_m: float) -> float:
-        """Start to move to that opening; return the one in its own resolution."""
+        """Start to move to that opening; return the one in its own resolution.
+
+        Raises:
+            RobotError: it is not active.
+        """
+        if not self._active:
+            raise RobotError(
+                "the gripper is not active: activate it on the teach pendant, or call calibrate, "
+                "which moves its fingers"
+            )
         share = min(1.0, max(0.0, opening_m / self._opening_m))
         self._target = round(self._closed_at + share * (self._open_at - self._closed_at))
         return self._to_m(self._target)

@@ -210,7 +210,7 @@ class Session:
         if self._stop.given:
             return ""
         if met:
-            self._log.event("success")
+            self._log.event("success", self._at_ns)
             return "success"
         return "timeout" if step == most_ticks else None
 

@@ -132,16 +132,16 @@ def open_cell(config: CellConfig) -> Iterator[Cell]:
         dry_run=config.dry_run,
     )
     with robot:
-        robot.calibrate()
         if config.calibration is not None:
             calibration.check(robot)
+        robot.calibrate()
         looks = task is not None or config.camera is not None
         camera = choose_camera(config, robot) if looks else None
         yield Cell(robot, task, calibration, camera, bare)
 
 
 def _calibration(config: CellConfig, robot: Robot) -> Calibration:
-    from eisp_data.robots.calibration import Calibration, load_calibration
+    from eisp_data.robots.calibration import load_calibration, usual
 
     if config.calibration is not None:
         return load_calibration(config.calibration)
@@ -152,7 +152,7 @@ def _calibration(config: CellConfig, robot: Robot) -> Calibration:
         raise ConfigError(
             f"--robot {config.robot}: missing --calibration, a file that eisp-calibrate writes"
         )
-    return Calibration(robot.name, {})
+    return usual(robot)
 
 
 def _check_reach(cell: Cell, goal: np.ndarray) -> None:

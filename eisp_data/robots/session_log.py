@@ -119,10 +119,9 @@ class SessionLog:
         message = messages.transforms(poses, times, _TASK_FRAME)
         self._writer.log("/objects", message, self._epoch_ns + at_ns)
 
-    def event(self, kind: str, at_ns: int | None = None, **details: object) -> None:
-        """Record an event; see ``messages.EVENT_KINDS``. It happened now, if not said otherwise."""
-        at = self._now_ns() if at_ns is None else at_ns
-        self._writer.event(kind, self._epoch_ns + at, **details)
+    def event(self, kind: str, at_ns: int, **details: object) -> None:
+        """Record an event; see ``messages.EVENT_KINDS``."""
+        self._writer.event(kind, self._epoch_ns + at_ns, **details)
 
     def close(self) -> WriterStats:
         """Write what is waiting, the index and the footer; DataError if the disk refuses."""

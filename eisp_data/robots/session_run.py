@@ -6,6 +6,7 @@ Used by ``eisp-record`` and ``eisp-deploy`` alike; they differ in who decides.
 from __future__ import annotations
 
 import contextlib
+import os
 import select
 import sys
 import time
@@ -24,6 +25,8 @@ from eisp_data.robots.session_status import Status, StopSignal, stop_signals
 from eisp_data.storage.mcap.writer import WriterStats
 
 _BETWEEN_S = 0.1
+_MOST_BYTES = 4096
+"""Of a line in a terminal."""
 
 
 @dataclass(frozen=True)
@@ -164,13 +167,21 @@ def _pause(cell: Cell, session: Session, plan: Plan, status: Status, stop: StopS
     """Wait while a human sets the table; a twin's sets itself."""
     if cell.has_referee:
         return
+    # An enter from before does not count. Flushing the terminal would stop a background process.
+    while _typed(0.0):
+        pass
     status.say(f"set the table, then press enter (it goes on by itself after {plan.pause_s:g} s)")
     session.doing = "waiting for the table to be set"
     until = time.monotonic() + plan.pause_s
     while time.monotonic() < until and not stop.given:
-        if sys.stdin.isatty():
-            if select.select([sys.stdin], [], [], _BETWEEN_S)[0]:
-                sys.stdin.readline()
-                return
-        else:
-            time.sleep(_BETWEEN_S)
+        if b"\n" in (_typed(_BETWEEN_S) or b""):
+            return
+
+
+def _typed(wait_s: float) -> bytes | None:
+    """Return what somebody types meanwhile, empty at an end of input; None if there is nothing."""
+    if not sys.stdin.isatty():
+        time.sleep(wait_s)
+        return None
+    ready = select.select([sys.stdin], [], [], wait_s)[0]
+    return os.read(sys.stdin.fileno(), _MOST_BYTES) if ready else None

@@ -65,7 +65,7 @@ class Ur3Robot(Robot):
             raise
 
     def calibrate(self) -> None:
-        """Open and close the gripper once, to find its range."""
+        """Activate the gripper, and open and close it once to find its range."""
         self._gripper.calibrate()
 
     def now_s(self) -> float:
@@ -96,8 +96,9 @@ class Ur3Robot(Robot):
     def command(self, command: JointCommand) -> JointCommand:
         """Lead the arm to the targets within one control period."""
         self._link.newest()
+        opening_m = self._gripper.move(command.gripper_opening_m)
         self._link.lead_to(np.asarray(command.joint_position, float))
-        return JointCommand(command.joint_position, self._gripper.move(command.gripper_opening_m))
+        return JointCommand(command.joint_position, opening_m)
 
     def stop(self) -> None:
         """Slow down and stand still; a later command starts from there."""
@@ -128,6 +129,8 @@ class _Link:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
+            # Ctrl-C and a closed terminal are for us: it still has to stop the arm.
+            start_new_session=True,
         )
         threading.Thread(target=self._listen, args=(self._process,), daemon=True).start()
         until = time.monotonic() + _CONNECT_S

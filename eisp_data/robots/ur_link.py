@@ -6,8 +6,8 @@ controller supplied every 8 ms however busy the policy is.
 
 HZ is how often a target will come. Frames go both ways, each a letter, the length of what follows
 (2 bytes) and that: to it ``L`` with 6 doubles (be there one control period from now) and ``H``
-(halt); from it ``S`` with the state or ``E`` with a line on what went wrong. When its input ends it
-halts the arm and ends.
+(halt); from it ``S`` with the state or ``E`` with a line on what went wrong. When its input ends or
+its output is closed, it halts the arm and ends.
 """
 
 from __future__ import annotations
@@ -132,7 +132,11 @@ def _run(host: str, control_hz: float, commands: IO[bytes], states: IO[bytes]) -
     while True:
         with wish.lock:
             target, asked_s, ended = wish.target, wish.asked_s, wish.ended
-        write_frame(states, b"S", _state(receive, leader.refused))
+        try:
+            write_frame(states, b"S", _state(receive, leader.refused))
+        except OSError:
+            # Nobody listens: the other end was killed.
+            target, ended = None, True
         if ended and not receive.isConnected():
             return
         leader.step(target, asked_s)
@@ -155,8 +159,6 @@ def main() -> None:
         reason = str(error).strip().splitlines()[0]
         with contextlib.suppress(OSError):
             write_frame(states, b"E", reason.encode()[:1000])
-    except OSError:
-        pass
     # ur_rtde's own clean-up waits for a controller that may be gone.
     os._exit(0)
 

@@ -187,8 +187,8 @@ class Assembler:
 
 
 def _during(stretches: list[tuple[int, int]], ticks: np.ndarray) -> np.ndarray:
-    """Return (T, 1) float32: 1 in the rows that lie within one of the stretches."""
+    """Return (T, 1) float32: 1 in the rows from a stretch's start until before its end."""
     inside = np.zeros(len(ticks), np.float32)
     for start, end in stretches:
-        inside[(ticks >= start) & (ticks <= end)] = 1.0
+        inside[(ticks >= start) & (ticks < end)] = 1.0
     return inside[:, None]

@@ -55,6 +55,11 @@ class Backlog:
             self._changed.notify()
             return True
 
+    def add(self, item: Item) -> None:
+        """Add what takes no room and is never refused, from the thread that writes."""
+        with self._changed:
+            self._items.append(item)
+
     def take(self, timeout_s: float) -> list[Item] | None:
         """Return what is waiting, an empty list after ``timeout_s``, None once closed and empty."""
         with self._changed:

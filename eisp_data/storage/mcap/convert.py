@@ -18,6 +18,7 @@ from eisp_data.storage.mcap.columns import age_columns, extra_widths
 from eisp_data.storage.mcap.guess import guess_mapping
 from eisp_data.storage.mcap.mapping import Mapping, load_mapping
 from eisp_data.storage.mcap.reader import McapLog
+from eisp_data.storage.mcap.repair import repaired_path
 from eisp_data.storage.mcap.sources import Recording, load
 from eisp_data.storage.reader import read_sidecars
 
@@ -76,20 +77,29 @@ class ConvertReport:
     """Gaps, drops, damage and everything left out, one line each."""
 
 
-def find_inputs(inputs: tuple[Path, ...]) -> list[Path]:
-    """Return the MCAP files: those named, and those in the folders named, in order of name."""
-    found: list[Path] = []
+def find_inputs(inputs: tuple[Path, ...]) -> tuple[list[Path], list[str]]:
+    """Return the MCAP files: those named, and those in the folders named, in order of name.
+
+    None comes twice. In a folder the repaired copy of a file takes its place; the lines say so.
+    """
+    found: dict[Path, Path] = {}
+    lines: list[str] = []
     for path in inputs:
         if path.is_dir():
             inside = sorted(path.rglob("*.mcap"))
             if not inside:
                 raise DataError(f"{path}: no .mcap file in this folder")
-            found += inside
         elif path.exists():
-            found.append(path)
+            inside = [path]
         else:
             raise DataError(f"{path}: no such file or folder")
-    return found
+        for file in inside:
+            copy = repaired_path(file)
+            if copy in inside:
+                lines.append(f"{file.name}: left out for its repaired copy, {copy.name}")
+            else:
+                found.setdefault(file.resolve(), file)
+    return list(found.values()), lines
 
 
 def convert(
@@ -106,7 +116,7 @@ def convert(
             stay, as a whole dataset, and ``resume`` goes on from there.
         ConfigError: the mapping or a setting is wrong.
     """
-    paths = find_inputs(config.inputs)
+    paths, left_out = find_inputs(config.inputs)
     rate = Rate(config.rate_hz, config.epsilon_m, config.clock)
     mapping = _mapping(config, paths[0])
     report = ConvertReport()
@@ -130,12 +140,13 @@ def convert(
     if not report.episodes:
         why = f": {report.lines[0]}" if report.lines else ""
         raise DataError(f"{paths[0]}: no episode could be made of it{why}")
+    report.lines += left_out
     return report
 
 
 def suggested_mapping(config: ConvertConfig) -> str:
     """Return the text of the mapping file that ``convert`` would use, to be edited by hand."""
-    return _mapping(config, find_inputs(config.inputs)[0]).to_yaml()
+    return _mapping(config, find_inputs(config.inputs)[0][0]).to_yaml()
 
 
 def _made(

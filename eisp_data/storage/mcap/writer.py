@@ -262,6 +262,8 @@ class McapWriter:
                 self._flag_drops()
                 self._flush_if_due()
             self._flag_drops()
+            for item in self._backlog.take(0) or []:
+                self._write(item)
             self._writer.finish()
             self._sync()
         except Exception as error:  # Whatever it is, the recording ends here and says so.
@@ -297,18 +299,18 @@ class McapWriter:
         return self._writer.register_channel(topic, "protobuf", self._schemas[name], metadata)
 
     def _flag_drops(self) -> None:
-        now = self.now_ns()
         for topic, count in list(self._backlog.dropped.items()):
             new = count - self._flagged[topic]
             if new:
                 self._flagged[topic] = count
-                message = messages.event("dropped", now, {"topic": topic, "count": new})
+                # Queued like all others: events that wait already have earlier times and numbers.
                 with self._order:
-                    self._kinds.setdefault(EVENTS_TOPIC, (type(message), "events"))
-                    sequence = self._sequences[EVENTS_TOPIC]
+                    now, sequence = self.now_ns(), self._sequences[EVENTS_TOPIC]
                     self._sequences[EVENTS_TOPIC] += 1
-                data = message.SerializeToString()
-                self._write(Item(EVENTS_TOPIC, data, now, now, sequence, 0))
+                    message = messages.event("dropped", now, {"topic": topic, "count": new})
+                    self._kinds.setdefault(EVENTS_TOPIC, (type(message), "events"))
+                    data = message.SerializeToString()
+                    self._backlog.add(Item(EVENTS_TOPIC, data, now, now, sequence, 0))
 
     def _flush_if_due(self) -> None:
         if time.monotonic() - self._flushed_s >= self.config.flush_s:

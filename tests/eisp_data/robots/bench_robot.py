@@ -8,7 +8,7 @@ import numpy as np
 
 from eisp_data.errors import RobotError
 from eisp_data.robots.arms import joint_limits
-from eisp_data.robots.calibration import Calibration
+from eisp_data.robots.calibration import usual
 from eisp_data.robots.cell import HOME_RAD
 from eisp_data.robots.robot import CameraFrame, CameraIntrinsics, JointCommand, Reading, Robot
 
@@ -37,7 +37,7 @@ class BenchRobot(Robot):
         self.limits = joint_limits("ur3")
         self.joint_names = tuple(f"joint_{i}" for i in range(6))
         self.cameras = {"top": CameraIntrinsics(64, 48, np.eye(3))}
-        self.calibration = Calibration(self.name, {})
+        self.calibration = usual(self)
         self._now_s, self._joints, self._opening = 10.0, np.array(HOME_RAD), 0.08
         self.connected, self.standing = False, True
         self.sent: list[JointCommand] = []

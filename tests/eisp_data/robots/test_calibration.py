@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
 import numpy as np
 import pytest
 
 from eisp_data.cli import calibrate as command
 from eisp_data.errors import ConfigError, RobotError
 from eisp_data.robots import cell
+from eisp_data.robots.arms import get_arm
 from eisp_data.robots.calibration import Calibration, designed, load_calibration
 from eisp_data.robots.charuco import BoardView, board
 from eisp_data.robots.hand_eye import solve_hand_eye
+from eisp_data.robots.registry import make_robot
 from eisp_data.robots.robot import CameraIntrinsics
+from eisp_data.robots.robot_config import make_configured
+from eisp_data.robots.session_cell import CellConfig, _calibration
 
 LENS = CameraIntrinsics(
     640,
@@ -68,6 +74,42 @@ def test_a_garbled_file_is_one_line_that_names_the_place(calibration, tmp_path, 
     with pytest.raises(ConfigError, match=said) as caught:
         load_calibration(path)
     assert "\n" not in str(caught.value) and str(path) in str(caught.value)
+
+
+def test_a_file_for_another_tool_than_the_arms_is_refused(calibration, tmp_path):
+    path = tmp_path / "cell.yaml"
+    calibration.save(path)
+    robot = make_robot("twin")
+    load_calibration(path).check(robot)
+    path.write_text(path.read_text().replace("- 0.165\n", "- 0.195\n", 1))
+    said = r"transform_tool_to_flange is .*0\.195.*, but that of ur3 is .*0\.165"
+    with pytest.raises(ConfigError, match=said):
+        load_calibration(path).check(robot)
+
+
+@pytest.mark.parametrize(
+    ("name", "side", "arm"),
+    [
+        pytest.param(
+            "ur3",
+            None,
+            "ur3",
+            marks=pytest.mark.skipif(not find_spec("rtde_control"), reason="no ur-rtde here"),
+        ),
+        ("tiago", "left", "tiago_left"),
+        ("tiago", "right", "tiago_right"),
+        ("twin", None, "ur3"),
+    ],
+)
+def test_without_a_file_and_a_task_everything_is_at_the_arms_usual_place(name, side, arm):
+    config = CellConfig(robot=name, host="127.0.0.1", side=side)
+    robot = make_configured(config, {})
+    found = _calibration(config, robot)
+    np.testing.assert_array_equal(found.transform_task_to_base, get_arm(arm).transform_task_to_base)
+    np.testing.assert_array_equal(
+        found.transform_tool_to_flange, get_arm(arm).transform_tool_to_tip
+    )
+    assert found.robot == robot.name
 
 
 def test_a_missing_file_is_one_line(tmp_path):
@@ -151,7 +193,7 @@ def test_the_command_finds_where_the_twins_camera_really_is(tmp_path, capsys):
 )
 def test_the_calibration_of_another_cell_is_refused(calibration, change, said):
     class Other:
-        name = change.get("robot", "twin")
+        name, arm = change.get("robot", "twin"), "ur3"
         cameras = change.get("cameras", {"top": LENS})
 
     with pytest.raises(ConfigError, match=said):

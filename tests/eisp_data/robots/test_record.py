@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
+import threading
+import time
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from bench_robot import BenchRobot
-from hand_on_device import HandOnGamepad, HandOnKeyboard
+from hand_on_device import STAY, HandOnGamepad, HandOnKeyboard
 from image_samples import skip_without_opengl
 
 from eisp_data.errors import ConfigError, EispError, RobotError
 from eisp_data.robots import registry, teleop
+from eisp_data.robots.estimates import Estimates, ObjectEstimate
 from eisp_data.robots.loop import POLLS, Ticks
 from eisp_data.robots.record import RecordConfig, check, record
+from eisp_data.robots.record_controllers import Decision, Human, Slowed, Watched
 from eisp_data.robots.session import Session
-from eisp_data.robots.session_view import HandEyes
+from eisp_data.robots.session_view import HandEyes, Seen, seen
+from eisp_data.robots.tool_history import ToolState
 from eisp_data.storage.lerobot import read_episodes
 from eisp_data.storage.mcap.convert import ConvertConfig, convert
 from eisp_data.storage.mcap.reader import McapLog
@@ -133,6 +139,21 @@ def test_a_teleoperated_session_becomes_a_dataset_of_what_the_hand_did(
     assert bench.made[0].sent[-1].gripper_opening_m == 0.0
 
 
+def test_a_success_that_is_seen_late_in_its_tick_is_marked_in_its_episode(
+    tmp_path: Path, bench: type[BenchRobot], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def look(self: HandEyes, frames: dict[str, object], reading: object) -> None:
+        bench.made[0].wait_until(bench.made[0].now_s() + 0.002)
+
+    hand_on(monkeypatch, HandOnGamepad(reads=100))
+    monkeypatch.setattr(HandEyes, "look", look)
+    monkeypatch.setattr(Session, "_is_met", lambda self, seen: True)
+    report = record(recorded(tmp_path))
+    convert(ConvertConfig(inputs=(report.output,), to=tmp_path / "data"))
+    [episode] = read_episodes(tmp_path / "data")
+    assert (episode.info["outcome"], episode.info["success_mark"]) == ("success", True)
+
+
 def test_directions_of_the_keyboard_are_those_of_the_table_and_a_held_key_counts_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -146,6 +167,76 @@ def test_directions_of_the_keyboard_are_those_of_the_table_and_a_held_key_counts
     keyboard.close()
     with pytest.raises(RobotError, match="keyboard: disconnected"):
         keyboard.read()
+
+
+class Moves:
+    """Moves by one whole displacement at a time, and squeezes; may want a look first."""
+
+    name = "moves"
+
+    def __init__(self, looking: bool = False) -> None:
+        self._looking, self.decided = looking, 0
+
+    def begin(self, seen: Seen, goal: np.ndarray, seed: int) -> None:
+        self.decided = 0
+
+    def act(self, seen: Seen) -> Decision:
+        self.decided += 1
+        return Decision(np.array([1.0, 0.0, 0.0, -1.0]), looking=self._looking)
+
+
+class HandThatTakesOver(HandOnGamepad):
+    """Leaves the fingers alone; has the controls in those reads that are named."""
+
+    def __init__(self, reads: set[int]) -> None:
+        super().__init__(reads=100)
+        self._reads, self._read = reads, -1
+
+    def get_action(self) -> dict[str, object]:
+        self._read += 1
+        self._takes_over = self._read in self._reads
+        return super().get_action() | {"gripper": STAY}
+
+
+@pytest.fixture
+def at_rest() -> Seen:
+    """Stack's table; what is between the fingers keeps them half open."""
+    tool = ToolState(0.0, np.eye(4), np.zeros(3), np.zeros(3), 0.04, 0.0)
+    block = ObjectEstimate(np.eye(4), np.zeros(3), np.zeros(3), 0.0, held=False)
+    return seen(TASKS["stack"], 0.0, Estimates(tool, {f"block{i}": block for i in range(3)}))
+
+
+def watched(monkeypatch: pytest.MonkeyPatch, inner: Moves, reads: set[int], at: Seen) -> Watched:
+    hand_on(monkeypatch, HandThatTakesOver(reads))
+    human = Human(teleop.Teleop("gamepad"), speed=1.0)
+    controller = Watched(Slowed(inner, TASKS["stack"], ticks=2), human)
+    controller.begin(at, np.zeros(9), 0)
+    return controller
+
+
+def test_who_takes_over_keeps_hold_and_who_gets_it_back_decides_anew(
+    monkeypatch: pytest.MonkeyPatch, at_rest: Seen
+) -> None:
+    inner = Moves()
+    controller = watched(monkeypatch, inner, {1, 2}, at_rest)
+    decided, decisions = [], []
+    for _ in range(6):
+        decisions.append(controller.act(at_rest))
+        decided.append(inner.decided)
+    assert [each.by_human for each in decisions] == [False, True, True, False, False, False]
+    # Its fingers' last command, which squeezes, not where they are.
+    assert [each.action[3] for each in decisions] == [-1.0] * 6
+    # The second half of the first displacement was for where the arm was before.
+    assert decided == [1, 1, 1, 2, 2, 3]
+
+
+def test_who_takes_over_after_a_look_finds_the_fingers_open(
+    monkeypatch: pytest.MonkeyPatch, at_rest: Seen
+) -> None:
+    controller = watched(monkeypatch, Moves(looking=True), {1}, at_rest)
+    decisions = [controller.act(at_rest) for _ in range(2)]
+    assert [each.looking for each in decisions] == [True, False]
+    assert decisions[1].action[3] == 1.0
 
 
 @pytest.mark.parametrize("device", ["keyboard", "gamepad"])
@@ -203,6 +294,37 @@ def test_ctrl_c_ends_between_two_ticks_with_a_standing_robot_and_a_closed_log(
     assert bench.made[0].standing and not bench.made[0].connected
     assert end_of(tmp_path / "a.mcap") == (True, [""], 10)
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_only_an_enter_after_the_words_starts_the_next_episode(
+    tmp_path: Path, bench: type[BenchRobot], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keys, terminal = os.openpty()
+    read_s: list[float] = []
+
+    class HandThatLeansOnEnter(HandOnGamepad):
+        def get_action(self) -> dict[str, float]:
+            os.write(keys, b"\n")
+            read_s.append(time.monotonic())
+            return super().get_action()
+
+    class Operator(io.StringIO):
+        """Reads the words; ends the input, which is no enter, and presses it a moment later."""
+
+        def write(self, text: str) -> int:
+            if "press enter" in text:
+                os.write(keys, b"\x04")
+                threading.Timer(0.4, os.write, (keys, b"\n")).start()
+            return super().write(text)
+
+    hand_on(monkeypatch, HandThatLeansOnEnter(reads=5))
+    monkeypatch.setattr("sys.stderr", Operator())
+    with os.fdopen(terminal) as stdin:
+        monkeypatch.setattr("sys.stdin", stdin)
+        report = record(recorded(tmp_path, episodes=2, pause_s=30.0))
+    os.close(keys)
+    assert [ended.ticks for ended in report.episodes] == [5, 0]
+    assert 0.4 < read_s[6] - read_s[5] < 20
 
 
 def test_an_error_of_our_own_leaves_a_standing_robot_and_a_closed_log(

@@ -28,6 +28,22 @@ HOME = np.array(get_arm("ur3").home)
 HOST = f"127.{os.getpid() % 200 + 20}.0.7"
 """ur_rtde knows its ports by heart, so that two tests at once need two addresses."""
 
+POLICY = """
+import signal, sys, time
+from eisp_data.robots.robot import JointCommand
+from eisp_data.robots.ur3 import Ur3Robot
+
+signal.signal(int(sys.argv[2]), signal.SIG_DFL)
+with Ur3Robot(sys.argv[1]) as robot:
+    here = robot.observe().joint_position
+    for number in range(1, 1000):
+        robot.command(JointCommand(here + 0.01 * number, 0.04))
+        time.sleep(0.04)
+        if number == 10:
+            print("moving", flush=True)
+"""
+"""Leads the arm until it is killed."""
+
 
 class Controller:
     """The stand-in in a process of its own."""
@@ -123,11 +139,33 @@ def test_stop_ends_the_servo_mode_and_a_new_command_begins_it_again(ur3, control
     soon(lambda: np.allclose(controller.joints(), HOME, atol=1e-6))
 
 
-def test_calibration_finds_the_ends_of_the_grippers_range(ur3, controller):
-    ur3.calibrate()
-    lines = controller.ask()["lines"]
-    assert {"SET ACT 1", "SET POS 0 SPE 255 FOR 60 GTO 1"} <= set(lines)
-    assert ur3.observe().gripper_opening_m == pytest.approx(0.085)
+def test_calibration_activates_the_gripper_and_finds_the_ends_of_its_range(controller):
+    controller.ask("power_up_gripper")
+    with SafeRobot(Ur3Robot(HOST)) as robot:
+        robot.calibrate()
+        lines = controller.ask()["lines"]
+        assert {"SET ACT 1", "SET POS 0 SPE 255 FOR 60 GTO 1"} <= set(lines)
+        reading = robot.observe()
+        assert reading.gripper_opening_m == pytest.approx(0.085)
+        robot.command(JointCommand(reading.joint_position, 0.085))
+
+
+def test_a_dry_run_leaves_the_gripper_as_it_is(controller):
+    controller.ask("power_up_gripper")
+    with SafeRobot(Ur3Robot(HOST), dry_run=True) as robot:
+        robot.calibrate()
+        robot.command(JointCommand(robot.observe().joint_position, 0.0))
+    said = {line for line in controller.ask()["lines"] if not line.startswith("GET")}
+    assert said <= {"SET GTO 0"}, "stand still is all that it was told"
+
+
+def test_without_an_active_gripper_nothing_moves(controller):
+    controller.ask("power_up_gripper")
+    with Ur3Robot(HOST) as robot:
+        with pytest.raises(RobotError, match="the gripper is not active") as caught:
+            robot.command(JointCommand(HOME + 0.1, 0.04))
+        assert "\n" not in str(caught.value)
+    np.testing.assert_array_equal(controller.joints(), HOME)
 
 
 def test_a_connection_lost_in_mid_motion_is_an_error_and_ends_in_time(ur3, controller):
@@ -153,6 +191,23 @@ def test_a_link_that_falls_silent_lets_the_controller_stop_the_arm(ur3, controll
     np.testing.assert_array_equal(controller.joints(), standing)
     with pytest.raises(RobotError, match="is lost"):
         ur3.observe()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_the_arm_is_stopped_when_a_terminal_kills_who_leads_it(controller, number):
+    policy = subprocess.Popen(
+        [sys.executable, "-c", POLICY, HOST, str(int(number))],
+        stdout=subprocess.PIPE,
+        start_new_session=True,
+    )
+    assert policy.stdout.readline()
+    os.killpg(policy.pid, number)
+    policy.communicate()
+    soon(lambda: {16, 255} <= set(controller.ask()["commands"]))  # servoStop, stopScript
+    standing = controller.joints()
+    assert np.abs(standing - HOME).max() > 0.0
+    time.sleep(0.3)
+    np.testing.assert_array_equal(controller.joints(), standing)
 
 
 def test_a_protective_stop_is_named(ur3, controller):

@@ -80,7 +80,7 @@ class UrController:
         self.lines: list[str] = []
         self.script = ""
         self.protective_stop = False
-        self.gripper = {"ACT": 0, "STA": 0, "GTO": 0, "POS": 3, "PRE": 3, "OBJ": 0, "FLT": 0}
+        self.gripper = {"ACT": 1, "STA": 3, "GTO": 0, "POS": 3, "PRE": 3, "OBJ": 0, "FLT": 0}
         self._gripper_range = (3, 228)
         self._registers: dict[str, float] = {}
         self._program_running = False
@@ -255,11 +255,16 @@ def _exactly(link, size):
 
 
 def main() -> None:
-    """Be the controller until the input ends; ``protective_stop`` makes it refuse to move."""
+    """Be the controller until the input ends.
+
+    ``protective_stop`` makes it refuse to move, ``power_up_gripper`` leaves the gripper inactive.
+    """
     controller = UrController(sys.argv[1], np.array(json.loads(sys.argv[2])))
     print("{}", flush=True)
     for line in sys.stdin:
         controller.protective_stop |= line.strip() == "protective_stop"
+        if line.strip() == "power_up_gripper":
+            controller.gripper |= {"ACT": 0, "STA": 0}
         state = {
             "joints": controller.joints.tolist(),
             "commands": controller.commands,

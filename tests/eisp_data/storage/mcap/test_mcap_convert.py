@@ -28,6 +28,7 @@ from eisp_data.storage.mcap.convert import (
     convert,
     suggested_mapping,
 )
+from eisp_data.storage.mcap.repair import repair
 from eisp_data.storage.mcap.writer import McapWriter
 from eisp_data.storage.rewrite import Source, rewrite
 
@@ -144,6 +145,25 @@ def test_resume_converts_what_a_repair_had_lost_and_nothing_twice(tmp_path: Path
     expected = [episodes[number] for number in (0, 2, 3, 5, 1, 4)]
     assert all(map(same, expected, read_episodes(less)))
     assert convert(ConvertConfig(inputs=files, to=less, resume=True)).written == 0
+
+
+def test_in_a_folder_a_repaired_copy_takes_the_place_of_its_original_and_no_file_comes_twice(
+    tmp_path: Path, session_file: Path
+) -> None:
+    whole = session_file.read_bytes()
+    folder, other = tmp_path / "in", tmp_path / "in/b.mcap"
+    folder.mkdir()
+    record_session(other, episodes=1)
+    (folder / "a.mcap").write_bytes(whole[: len(whole) * 2 // 3])
+    repair(folder / "a.mcap")
+    again = folder / ".." / "in" / "b.mcap"
+    report = convert(ConvertConfig(inputs=(folder, other, again), to=tmp_path / "d"))
+    files = [episode.info["source_file"] for episode in read_episodes(tmp_path / "d")]
+    assert files.count("b.mcap") == 1 and set(files) == {"a.repaired.mcap", "b.mcap"}
+    assert "a.mcap: left out for its repaired copy, a.repaired.mcap" in report.lines
+    # Whoever names the damaged file gets it.
+    episodes, _ = run(folder / "a.mcap", tmp_path / "named")
+    assert {episode.info["source_file"] for episode in episodes} == {"a.mcap"}
 
 
 def test_another_recording_or_rule_cannot_be_resumed_into_a_dataset(tmp_path: Path) -> None:

@@ -32,6 +32,7 @@ def test_episodes_are_cut_at_their_events(tmp_path: Path) -> None:
         [
             ("episode_start", 0.2, {"operator": "ann"}),
             ("success", 0.5, {}),
+            ("intervention_start", 0.52, {}),
             ("episode_end", 0.6, {"outcome": "success"}),
             ("episode_start", 0.8, {}),
             ("episode_end", 1.0, {"outcome": "discard"}),
@@ -50,8 +51,9 @@ def test_episodes_are_cut_at_their_events(tmp_path: Path) -> None:
     assert episodes[0].info["operator"] == "ann" and episodes[0].info["success_mark"] is True
     assert episodes[0].observation[0, 0] == pytest.approx(0.2)
     assert any("discarded" in line for line in report.lines)
-    held = rows(tmp_path / "d")["intervention"][-15:]
-    assert np.flatnonzero(held).tolist() == [2, 3, 4]
+    # An intervention ends with the first action that is not the human's, or with the episode.
+    held = np.split(rows(tmp_path / "d")["intervention"], [10, 15])
+    assert [np.flatnonzero(h).tolist() for h in held] == [[8, 9], [], [2, 3]]
 
 
 def test_without_events_the_whole_recording_is_one_episode(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from eisp_data.errors import ConfigError, DataError
 from eisp_data.storage.mcap import messages
 from eisp_data.storage.mcap import writer as writer_module
 from eisp_data.storage.mcap.backlog import Backlog, Item
+from eisp_data.storage.mcap.check import checks
 from eisp_data.storage.mcap.reader import McapLog
 from eisp_data.storage.mcap.repair import repair
 from eisp_data.storage.mcap.writer import McapWriter, McapWriterConfig
@@ -141,6 +142,34 @@ def test_drops_between_two_messages_show_in_the_sequence(
         while not writer.image("/camera", frame):
             taken.append(False)
     assert repair(tmp_path / "run.mcap").missing == {"/camera": taken.count(False)}
+
+
+def test_the_flag_of_a_drop_comes_after_the_events_that_wait_already(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, go_on, encode = threading.Event(), threading.Event(), messages.encode_jpeg
+
+    def slow(image: np.ndarray, quality: int) -> bytes:
+        begun.set()
+        go_on.wait(30)
+        return encode(image, quality)
+
+    monkeypatch.setattr(messages, "encode_jpeg", slow)
+    path, frame = tmp_path / "run.mcap", np.zeros((64, 64, 3), np.uint8)
+    with McapWriter(path, McapWriterConfig(queue_bytes=100_000, fsync=False)) as writer:
+        writer.event("episode_start")
+        writer.image("/camera", frame)
+        assert begun.wait(30)
+        while writer.image("/camera", frame):
+            pass
+        writer.event("success")
+        writer.event("episode_end")
+        go_on.set()
+    assert writer.stats().dropped == {"/camera": 1}
+    with McapLog(path) as log:
+        entries = list(log.messages({"/events"}, in_order=False))
+    assert [entry.message.sequence for entry in entries] == [0, 1, 2, 3]
+    assert all(check.passed for check in checks(path))
 
 
 def test_the_queue_never_holds_more_than_its_limit() -> None:
