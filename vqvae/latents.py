@@ -14,7 +14,7 @@ import torch
 
 from eisp_data.errors import DataError
 from eisp_data.sim.pixels import Pixels
-from eisp_data.storage.cache import DatasetArrays, cached, load_arrays, load_images
+from eisp_data.storage.cache import DatasetArrays, cached, load_arrays, load_images, unchanged
 from eisp_data.storage.reader import read_spec
 from eisp_data.tasks.base import OBJECT_DIM
 from eisp_data.tasks.images import IMAGE_TASKS, goal_state, image_task
@@ -114,10 +114,11 @@ def load_latent_arrays(root: Path, model: VqVae, config: VisionConfig) -> Datase
     Raises:
         DataError: the dataset is of another task than the VQ-VAE, or has not its images.
     """
-    arrays = load_arrays(root)
+    with unchanged(root):
+        arrays = load_arrays(root)
+        check_task(root, arrays, config)
+        seen = see(model, load_codes(root, model, config.camera))
     spec = arrays.spec
-    check_task(root, arrays, config)
-    seen = see(model, load_codes(root, model, config.camera))
     observation = observe(arrays.observation[:, : spec.proprio_dim], seen, model.places)
     name = image_task(spec.task)
     goals = cached(

@@ -21,7 +21,7 @@ from eisp_data.runs.episodes import hold_out, rows_of
 from eisp_data.runs.folder import begin_run, check_same_dataset, has_progress
 from eisp_data.runs.memory import keep_freed_memory
 from eisp_data.runs.metrics import MetricsLog
-from eisp_data.storage.cache import DatasetArrays, load_arrays, load_images
+from eisp_data.storage.cache import DatasetArrays, load_arrays, load_images, unchanged
 from eisp_data.storage.files import one_line
 from vqvae import reading, saved
 from vqvae.config import VisionConfig, VqVaeTrainConfig
@@ -180,7 +180,8 @@ def load_frames(
     """
     root, camera = config.dataset.root, config.dataset.camera
     check_images(root, camera, config.model.image_size)
-    images, arrays = load_images(root, camera), load_arrays(root)
+    with unchanged(root):
+        images, arrays = load_images(root, camera), load_arrays(root)
     held, rest = hold_out(root, arrays, config.validation_share, config.seed)
     return images, arrays, rest, held
 

@@ -16,7 +16,7 @@ from eisp_data.robots.kinematics import kinematics
 from eisp_data.robots.markers import marked_objects
 from eisp_data.robots.pose import PoseFit, Priors, View, fit_pose, fit_slide
 from eisp_data.robots.robot import CameraFrame, Reading
-from eisp_data.robots.tool_history import ToolHistory, ToolState
+from eisp_data.robots.tool_history import ToolHistory
 from eisp_data.robots.tracks import HALF_M, BlockTrack, DrawerTrack
 from eisp_data.sim.drawer import TRAY_CENTRE_M
 from eisp_data.tasks.base import Task
@@ -76,11 +76,17 @@ class Tracker:
         before = self._tools.newest if self._tools else None
         tool = self._tools.add(reading)
         before = before or tool
+        was = None if self._drawer is None else self._drawer.opening_m
+        inside = [(b, b.seen_s) for b in self._blocks.values() if self._in_tray(b.pose, was)]
         if frame is not None and frame.sequence != self._sequence:
             self._sequence = frame.sequence
             self._see(frame)
         if self._drawer is not None:
-            self._follow_drawer(self._drawer, before.transform_tool_to_task, tool)
+            self._drawer.follow(before.transform_tool_to_task, tool)
+            way = (self._drawer.opening_m or 0.0) - (was or 0.0)
+            for block, seen_s in inside:
+                if block.seen_s == seen_s:  # else it is where the image showed it
+                    block.shift(way * _OPENS)
         for name, block in self._blocks.items():
             block.follow(before, tool, partial(self._standing_height, name))
         return self.estimates()
@@ -157,15 +163,6 @@ class Tracker:
             if fit is not None:
                 fit = self._taken_along(fit, frame.captured_s)
                 block.see(fit, frame.captured_s, then, since)
-
-    def _follow_drawer(self, drawer: DrawerTrack, before: np.ndarray, tool: ToolState) -> None:
-        """Let the drawer follow the fingers, and what lies in it follow the drawer."""
-        was = drawer.opening_m
-        inside = [block for block in self._blocks.values() if self._in_tray(block.pose, was)]
-        drawer.follow(before, tool)
-        if drawer.opening_m is not None and was is not None:
-            for block in inside:
-                block.shift((drawer.opening_m - was) * _OPENS)
 
     def _taken_along(self, fit: PoseFit, captured_s: float) -> PoseFit:
         """Return the pose of a block that an image shows, with what the drawer did to it since."""

@@ -11,7 +11,8 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -137,6 +138,15 @@ def load_images(root: Path | str, camera: str) -> np.ndarray:
     )
 
 
+@contextmanager
+def unchanged(root: Path) -> Iterator[None]:
+    """Read several parts of a dataset that belong together; DataError if it changed meanwhile."""
+    before = fingerprint(root)
+    yield
+    if fingerprint(root) != before:
+        raise DataError(f"{root}: changed while it was read; wait for its writer to end")
+
+
 def cached[T](root: Path, part: str, fill: Callable[[Path], None], open_: Callable[[Path], T]) -> T:
     """Return what ``open_`` reads from a part of a dataset's cache, filled first where needed.
 
@@ -152,6 +162,9 @@ def cached[T](root: Path, part: str, fill: Callable[[Path], None], open_: Callab
         folder = _folder(root) / f"{key}{part}"
         if not (folder / "done").exists():
             _build(fill, folder, key)
+            if fingerprint(root) != key:  # a writer was at work: who knows what this is of
+                shutil.rmtree(folder, ignore_errors=True)
+                continue
         try:
             return open_(folder)
         except FileNotFoundError:

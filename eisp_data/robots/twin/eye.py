@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -61,7 +62,7 @@ class ThreadEye:
         """
         self._open, self._snapshots, self._wait = open_camera, snapshots, wait
         self._period_s, self._latency_s = period_s, latency_s
-        self._frames: deque[CameraFrame] = deque(maxlen=8)
+        self._frames: deque[CameraFrame] = deque(maxlen=8 + math.ceil(latency_s / period_s))
         self._newest: CameraFrame | None = None
         self._running, self._ready = True, threading.Event()
         self._failure: Exception | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 
@@ -45,7 +46,8 @@ class World:
         rng: np.random.Generator,
     ) -> None:
         self.model, self.data = model, mujoco.MjData(model)
-        self.snapshots: deque[Snapshot] = deque(maxlen=8)
+        waiting = math.ceil(camera.latency_s * camera.rate_hz)
+        self.snapshots: deque[Snapshot] = deque(maxlen=8 + waiting)
         self._limits, self._camera, self._rng = limits, camera, rng
         self._sequence = 0
         self._position = np.array([model.joint(name).qposadr[0] for name in JOINTS])

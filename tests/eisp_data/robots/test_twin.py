@@ -159,11 +159,12 @@ def test_a_stop_from_another_thread_brings_the_arm_to_rest_for_good():
         )
 
 
-def test_an_image_comes_late_by_its_latency_and_keeps_its_time():
-    with TwinRobot(camera=CameraOptions(latency_s=0.1)) as robot:
-        robot.wait_until(0.09)
+@pytest.mark.parametrize("latency_s", [0.1, 0.9])
+def test_an_image_comes_late_by_its_latency_and_keeps_its_time(latency_s):
+    with TwinRobot(camera=CameraOptions(latency_s=latency_s)) as robot:
+        robot.wait_until(latency_s - 0.01)
         assert robot.frames() == {}
-        robot.wait_until(0.25)
+        robot.wait_until(latency_s + 0.15)
         frame = robot.frames()[CAMERA]
         assert frame.sequence == 4 and frame.captured_s == pytest.approx(4 / 30, abs=0.002)
         assert frame.image.shape == (480, 640, 3) and frame.image.dtype == np.uint8

@@ -11,7 +11,14 @@ import pytest
 from storage_samples import random_episode, spec_of
 
 from eisp_data.errors import DataError
-from eisp_data.storage.cache import DatasetArrays, fingerprint, load_arrays, load_images
+from eisp_data.storage.cache import (
+    DatasetArrays,
+    cached,
+    fingerprint,
+    load_arrays,
+    load_images,
+    unchanged,
+)
 from eisp_data.storage.lerobot import DatasetWriter
 
 ROWS = ("observation", "achieved_goal", "success", "sim_state")
@@ -43,6 +50,31 @@ def episode_slices(arrays: DatasetArrays) -> Iterator[slice]:
 def test_rows_are_the_episodes_one_after_the_other(make_dataset):
     root, episodes = make_dataset()
     check(load_arrays(root), episodes)
+
+
+def append_to(root) -> None:
+    with DatasetWriter(root, spec_of(), {"policy": "script", "seed": 0}, resume=True) as writer:
+        writer.write([random_episode(spec_of(), 4, 99)])
+
+
+def test_what_was_built_while_a_writer_was_at_work_is_built_again(make_dataset):
+    root, episodes = make_dataset()
+    built = []
+
+    def fill(folder):
+        built.append(len(load_arrays(root).seed))
+        if len(built) == 1:
+            append_to(root)
+        (folder / "count").write_text(str(built[-1]))
+
+    said = cached(root, "-count", fill, lambda folder: (folder / "count").read_text())
+    assert built == [len(episodes), len(episodes) + 1] and said == str(len(episodes) + 1)
+
+
+def test_parts_of_a_dataset_that_grows_are_not_put_together(make_dataset):
+    root, _ = make_dataset()
+    with pytest.raises(DataError, match="changed while it was read; wait"), unchanged(root):
+        append_to(root)
 
 
 def test_arrays_are_mapped_not_read_and_cannot_be_written(make_dataset):
