@@ -108,6 +108,8 @@ def plan_push(
             items.append(Item(CARD, policy_card(path, license_name, citation).encode()))
         return Plan(repo_id, "model", kind, items)
     _refuse_failed(path, validate(path))
+    for folder in DATASET_FOLDERS:
+        _refuse_link(path / folder)
     items = [
         Item(p.relative_to(path).as_posix(), p) for f in DATASET_FOLDERS for p in _files(path / f)
     ]
@@ -228,14 +230,18 @@ def _refuse_failed(path: Path, checks: Sequence[Check]) -> None:
 def _files(folder: Path) -> list[Path]:
     """Return the files under a folder but hidden ones, in order; DataError if one is a link."""
     files = []
-    for path in [folder, *sorted(folder.rglob("*"))]:
+    for path in sorted(folder.rglob("*")):
         if any(part.startswith(".") for part in path.relative_to(folder).parts):
             continue
-        if path.is_symlink():  # what it leads to may be outside, and may be private
-            raise DataError(f"{path}: a link; push a copy that has the files themselves (cp -rL)")
+        _refuse_link(path)
         if path.is_file():
             files.append(path)
     return files
+
+
+def _refuse_link(path: Path) -> None:
+    if path.is_symlink():  # what it leads to may be outside, and may be private
+        raise DataError(f"{path}: a link; push a copy that has the files themselves (cp -rL)")
 
 
 @contextmanager

@@ -34,8 +34,16 @@ from pretrain.saved import saved_subgoals
 
 RESULTS, SETTINGS = "results.jsonl", "deploy.yaml"
 _MAY_DIFFER = {
-    *("output_dir", "resume", "episodes", "pause_s", "record_images"),
-    *("host", "camera_source", "realtime", "device", "threads"),
+    "output_dir",
+    "resume",
+    "episodes",
+    "pause_s",
+    "record_images",
+    "host",
+    "camera_source",
+    "realtime",
+    "device",
+    "threads",
 }
 """Settings that do not decide how an episode goes."""
 _STEP_S = 0.04

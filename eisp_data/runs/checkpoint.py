@@ -117,9 +117,10 @@ def newest(run: Path) -> Path:
     Raises:
         DataError: there is none.
     """
-    if not exists(run):
+    folders = _by_step(run)
+    if not folders:
         raise DataError(f"{run} holds no checkpoint")
-    return _by_step(run)[-1]
+    return folders[-1]
 
 
 def _by_step(run: Path) -> list[Path]:

@@ -173,7 +173,8 @@ def test_a_policy_comes_back_and_one_that_is_pickled_does_not_go(server, tmp_pat
     policy.mkdir()
     (policy / "config.json").write_text('{"agent": {"task": "stack"}}')
     (policy / "model.safetensors").write_bytes(bytes(50))
-    hub.push(hub.plan_push(policy, "lab/policy", "mit"))
+    (tmp_path / "link").symlink_to(policy)  # whoever names a link means what it leads to
+    hub.push(hub.plan_push(tmp_path / "link", "lab/policy", "mit"))
     card = server.files("model", "lab/policy")["README.md"].decode()
     assert "license: mit" in card and "- stack" in card and "@misc{eisp" in card
     hub.pull("lab/policy", tmp_path / "back", repo_type="model")
