@@ -12,7 +12,7 @@ without AMX the products stay fp32 by it: their error is printed. Each runs in a
 as it would at work, and all take short turns one after the other, so that whatever else the machine
 does meets them alike; the rates are over the sums of the turns. Processor time, with ``--threads
 1``, can be compared on a busy machine too. The limit is the arithmetic of one update at the rate at
-which oneDNN multiplies matrices of that size, fp32, on the same threads.
+which oneDNN multiplies matrices of that size, in bf16 and in fp32, on as many threads.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ import dataclasses
 import multiprocessing
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from multiprocessing.connection import Connection
 from unittest import mock
@@ -40,7 +41,7 @@ from pretrain.agent import BANK, Agent
 from pretrain.config import AgentConfig, GoalMix, SacConfig
 from pretrain.device import set_up
 from pretrain.layout import Layout
-from pretrain.learner import Learner
+from pretrain.learner import Learner, Sample
 from pretrain.replay import Trajectories
 
 TASK = get_task("stack")
@@ -102,13 +103,17 @@ class Ours:
 
     def update(self, count: int) -> float:
         """Take so many updates, and return the seconds that sampling took."""
-        sampling = 0.0
+        self._sampling = 0.0
+        for _ in self._learner.updates(self._samples(count), 0.0):
+            pass
+        return self._sampling
+
+    def _samples(self, count: int) -> Iterator[Sample]:
         for _ in range(count):
             start = time.perf_counter()
             batch = self._data.transitions(self._batch_size, self._mix, self._rng)
-            sampling += time.perf_counter() - start
-            self._learner.update(batch, 0.0, None)
-        return sampling
+            self._sampling += time.perf_counter() - start
+            yield Sample(batch, None)
 
 
 class StackShapes(gymnasium.Env):
@@ -185,8 +190,8 @@ class Peer:
         return 0.0
 
 
-def limit(options: Options, layers: tuple[int, ...]) -> tuple[float, float]:
-    """Return updates/s if an update were nothing but its products, and their relative error."""
+def products(layers: tuple[int, ...]) -> int:
+    """Return the multiplications of one update for one transition."""
     first, body = layers[0], sum(a * b for a, b in zip(layers, layers[1:], strict=False))
     actor = (S + G) * first + body + layers[-1] * 2 * A
     critic = (S + G + A) * first + body + layers[-1]
@@ -194,14 +199,27 @@ def limit(options: Options, layers: tuple[int, ...]) -> tuple[float, float]:
     # the inputs of first layers; and through the critics to the action.
     forward = 2 * actor + 6 * critic
     backward = 2 * actor - (S + G) * first + 2 * (2 * critic - (S + G + A) * first) + 2 * critic
-    torch.set_num_threads(options.threads)
+    return forward + backward
+
+
+def limit(options: Options, layers: tuple[int, ...], dtype: torch.dtype) -> tuple[float, float]:
+    """Return updates/s if an update were nothing but its products, and their relative error.
+
+    Each thread multiplies matrices of its own, which is faster than all of them together.
+    """
+    rows, width = options.batch_size, layers[0]
     torch.backends.mkldnn.matmul.fp32_precision = ONEDNN
-    left, right = torch.randn(options.batch_size, first), torch.randn(first, first)
-    seconds = min(timed(lambda: [left @ right for _ in range(50)]) for _ in range(10)) / 50
-    rate = left.numel() * first / seconds
+    left, right = torch.randn(rows, width).to(dtype), torch.randn(width, width).to(dtype)
+
+    def fastest() -> float:
+        return min(timed(lambda: [left @ right for _ in range(50)]) for _ in range(20)) / 50
+
+    with ThreadPoolExecutor(options.threads, "core", torch.set_num_threads, (1,)) as pool:
+        times = [pool.submit(fastest) for _ in range(options.threads)]
+        rate = sum(rows * width * width / each.result() for each in times)
     exact = left.double() @ right.double()
-    error = float((left @ right - exact).norm() / exact.norm())
-    return rate / (options.batch_size * (forward + backward)), error
+    error = float(((left @ right).double() - exact).norm() / exact.norm())
+    return rate / (rows * products(layers)), error
 
 
 def timed(work: Callable[[], object]) -> float:
@@ -267,19 +285,19 @@ def compare(options: Options, layers: tuple[int, ...]) -> None:
         pipe.send(0)
         process.join()
     updates = options.turns * options.turn_updates
-    bound, error = limit(options, layers)
     print(f"{layers[0]} x {len(layers)}, batch {options.batch_size}, {options.threads} threads")
     ours, fp32 = spent["ours"], spent["ours, fp32"]
     for name, total in spent.items():
         rate, processor = updates / total.wall, 1e3 * total.processor / updates
         faster, faster_fp32 = total.wall / ours.wall, total.wall / fp32.wall
         print(
-            f"  {name:18s} {rate:6.1f} updates/s; ours {faster:4.2f} times as fast,"
+            f"  {name:20s} {rate:6.1f} updates/s; ours {faster:4.2f} times as fast,"
             f" fp32 {faster_fp32:4.2f}; {processor:5.1f} ms of processor time"
         )
-    print(
-        f"  {'arithmetic limit':18s} {bound:6.1f} updates/s, fp32; error of a product {error:.0e}"
-    )
+    for dtype, name in ((torch.bfloat16, "bf16"), (torch.float32, "fp32")):
+        bound, error = limit(options, layers, dtype)
+        limited = f"products alone, {name}"
+        print(f"  {limited:20s} {bound:6.1f} updates/s; relative error {error:.0e}")
     print(f"  sampling: {ours.sampling / ours.wall:.1%} of our update")
 
 

@@ -8,7 +8,7 @@ Worlds start anew only between rounds, so that a trajectory is never cut in the 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -27,7 +27,7 @@ from finetune.rollout import SubgoalPolicy
 from pretrain import checkpoint
 from pretrain.agent import Agent
 from pretrain.config import GoalMix
-from pretrain.learner import Learner
+from pretrain.learner import Learner, Sample
 from pretrain.replay import Trajectories
 from pretrain.sac import Batch
 from pretrain.saved import POLICY
@@ -202,6 +202,13 @@ class Finetuner:
         info: dict[str, Tensor] = {}
         remaining = max(0.1, 1.0 - self._round / config.rounds)
         self._learner.set_lr(config.lr * remaining, config.generator_lr * remaining)
+        for found in self._learner.updates(self._samples(), self.agent.config.sac.cloning):
+            info |= found
+        return info
+
+    def _samples(self) -> Iterator[Sample]:
+        """Draw what the updates of a round learn from."""
+        config = self.config
         offline = round(config.offline_share * config.batch_size) if len(self._offline) else 0
         for update in range(1, config.updates + 1):
             parts = [self._online.transitions(config.batch_size - offline, self._mix, self._rng)]
@@ -210,10 +217,7 @@ class Finetuner:
             hindsight = None
             if config.generator_every and update % config.generator_every == 0:
                 hindsight = self._hindsight()
-            info |= self._learner.update(
-                Batch.joined(parts), self.agent.config.sac.cloning, hindsight
-            )
-        return info
+            yield Sample(Batch.joined(parts), hindsight)
 
     def _hindsight(self) -> tuple[Tensor, Tensor, Tensor] | None:
         """Draw what the generator learns from, out of old or new data as there is of each.

@@ -3,13 +3,15 @@
 In an update the critics, the actor and the generator take one step each, all from the same
 parameters. Nothing in it depends on the order in which the gradients are computed, so that two
 cores give bit for bit what one gives. On one of them run the critics, or in the updates that have
-one the generator, which costs as much as actor and critics together; on the other all the rest.
+one the generator, which costs at least as much as actor and critics together; on the other all the
+rest, and after it what the next update learns from is drawn.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import partial
 
 import torch
@@ -20,6 +22,16 @@ from pretrain.sac import Batch, Info
 
 _CLIP = 100.0
 """Norm to which the generator's gradient is cut."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What one update learns from."""
+
+    batch: Batch
+    """For actor and critics."""
+    hindsight: tuple[Tensor, Tensor, Tensor] | None
+    """For the generator, see ``Trajectories.subgoals``; None leaves it as it is."""
 
 
 class Learner:
@@ -55,37 +67,46 @@ class Learner:
         ):
             optimizer.param_groups[0]["lr"] = value
 
-    def update(
-        self, batch: Batch, cloning: float, hindsight: tuple[Tensor, Tensor, Tensor] | None
-    ) -> Info:
-        """Take one step.
+    def updates(self, samples: Iterator[Sample], cloning: float) -> Iterator[Info]:
+        """Take one step for each sample, when its info is asked for.
+
+        A sample is drawn before the step on the one before it is complete. Where the state of what
+        draws them is saved, no more of them may be left.
 
         Args:
-            batch: what actor and critics learn from.
+            samples: may not draw from torch's stream of random numbers.
             cloning: weight of the actor's cloning term.
-            hindsight: what the generator learns from, see ``Trajectories.subgoals``; None leaves
-                it as it is.
         """
+        drawn = self._next(samples)
+        while drawn:
+            batch, now, then, hindsight = drawn
+            # All of the noise of actor and critics comes first: beside the generator, which draws
+            # its own, nothing else may draw from the stream.
+            noise, later_noise = torch.randn(2, *batch.action.shape, device=now.device)
+            critic = partial(self._critic_gradient, batch, now, then, later_noise)
+            if hindsight:
+                beside = self._start(partial(self._generator_gradient, hindsight))
+                info = critic()
+            else:
+                beside, info = self._start(critic), {}
+            info |= self._actor_gradient(batch, now, noise, cloning)
+            drawn = self._next(samples)
+            info |= beside()
+            for optimizer in (self._critic, self._actor):
+                optimizer.step()
+            if hindsight:
+                self._generator.step()
+            self._sac.follow()
+            yield info
+
+    def _next(self, samples: Iterator[Sample]) -> _Drawn | None:
+        sample = next(samples, None)
+        if sample is None:
+            return None
         device = self._agent.bank.device
-        batch = batch.to(device)
-        # All of the noise of actor and critics comes first: beside the generator, which draws its
-        # own, nothing else may draw from the stream.
-        noise, later_noise = torch.randn(2, *batch.action.shape, device=device)
-        now, then = self._sac.see(batch)
-        critic = partial(self._critic_gradient, batch, now, then, later_noise)
-        if hindsight:
-            sample = [tensor.to(device) for tensor in hindsight]
-            beside = self._start(lambda: self._generator_gradient(sample))
-            info = critic()
-        else:
-            beside, info = self._start(critic), {}
-        info |= self._actor_gradient(batch, now, noise, cloning) | beside()
-        for optimizer in (self._critic, self._actor):
-            optimizer.step()
-        if hindsight:
-            self._generator.step()
-        self._sac.follow()
-        return info
+        batch = sample.batch.to(device)
+        hindsight = [tensor.to(device) for tensor in sample.hindsight or ()]
+        return batch, *self._sac.see(batch), hindsight
 
     def _start(self, work: Callable[[], Info]) -> Callable[[], Info]:
         if self._beside is not None:
@@ -107,6 +128,10 @@ class Learner:
         _gradient(loss, self._generator)
         torch.nn.utils.clip_grad_norm_(self._agent.proposer.parameters(), _CLIP)
         return info
+
+
+_Drawn = tuple[Batch, Tensor, Tensor, list[Tensor]]
+"""A batch, its features before and after, and what the generator learns from, on the device."""
 
 
 def _gradient(loss: Tensor, optimizer: torch.optim.Optimizer) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,7 @@ from pretrain.checks import check_pretrain
 from pretrain.config import PretrainConfig
 from pretrain.device import describe, set_up
 from pretrain.layout import Layout
-from pretrain.learner import Learner, threads_of_half
+from pretrain.learner import Learner, Sample, threads_of_half
 from pretrain.replay import Trajectories
 from pretrain.vision import check_resumed, load_seen, load_vision
 from vqvae.model import VqVae
@@ -69,33 +70,41 @@ def pretrain(config: PretrainConfig) -> Path:
         arrays = {name: value.cpu().numpy() for name, value in best_state.items()}
         checkpoint.save(run, done, agent, learner.optimizers, rng, numbers, arrays)
 
-    steps = range(done + 1, config.updates + 1)
-    bar = tqdm(steps, "pretraining", config.updates, initial=done, mininterval=1.0)
-    for update in bar:
-        remaining = 1.0 - update / config.updates
-        learner.set_lr(
-            config.agent.sac.lr * max(config.final_lr_share, remaining),
-            config.generator_lr * max(config.generator_final_lr_share, remaining),
-        )
-        batch = train.transitions(config.batch_size, config.agent.mix, rng)
-        hindsight = None
-        if update % config.generator_every == 0:
-            hindsight = train.subgoals(config.generator_batch_size, config.agent.mix, rng)
-        info |= learner.update(batch, config.agent.sac.cloning, hindsight)
-        if update % config.validate_every == 0 or update == config.updates:
-            held = validate(agent, held_out, device)
-            if float(held["log_likelihood"]) > best:
-                best = float(held["log_likelihood"])
-                state = agent.proposer.state_dict()
-                best_state = {name: value.clone() for name, value in state.items()}
-            bar.set_postfix(_in_words(held))
-            done, spent = update, time.monotonic() - start
-            values = {f"train/{k}": v for k, v in info.items()}
-            values |= {f"held_out/{k}": v for k, v in held.items()}
-            log.write(update, 0, spent, values)
-            finished = False
-            if update < config.updates:
-                save()
+    def samples(updates: range) -> Iterator[Sample]:
+        for update in updates:
+            batch = train.transitions(config.batch_size, config.agent.mix, rng)
+            hindsight = None
+            if update % config.generator_every == 0:
+                hindsight = train.subgoals(config.generator_batch_size, config.agent.mix, rng)
+            yield Sample(batch, hindsight)
+
+    bar = tqdm(None, "pretraining", config.updates, initial=done, mininterval=1.0)
+    while done < config.updates:
+        until = min(done + config.validate_every - done % config.validate_every, config.updates)
+        updates = range(done + 1, until + 1)
+        learning = learner.updates(samples(updates), config.agent.sac.cloning)
+        for update in updates:
+            remaining = 1.0 - update / config.updates
+            learner.set_lr(
+                config.agent.sac.lr * max(config.final_lr_share, remaining),
+                config.generator_lr * max(config.generator_final_lr_share, remaining),
+            )
+            info |= next(learning)
+            bar.update()
+        held = validate(agent, held_out, device)
+        if float(held["log_likelihood"]) > best:
+            best = float(held["log_likelihood"])
+            state = agent.proposer.state_dict()
+            best_state = {name: value.clone() for name, value in state.items()}
+        bar.set_postfix(_in_words(held))
+        done, spent = until, time.monotonic() - start
+        values = {f"train/{k}": v for k, v in info.items()}
+        values |= {f"held_out/{k}": v for k, v in held.items()}
+        log.write(done, 0, spent, values)
+        finished = False
+        if done < config.updates:
+            save()
+    bar.close()
     log.close()
     if not finished:
         agent.proposer.load_state_dict(best_state)

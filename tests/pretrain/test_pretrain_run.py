@@ -182,14 +182,14 @@ def test_a_run_that_diverges_is_told_and_the_checkpoint_before_is_of_use(
     stack_dataset, tmp_path, monkeypatch
 ):
     config = tiny_pretraining(stack_dataset, tmp_path)
-    update, seen = Learner.update, iter(range(100))
+    updates, seen = Learner.updates, iter(range(100))
 
     def diverge(learner, *args):
-        info = update(learner, *args)
-        return info | {"critic_loss": torch.tensor(np.nan)} if next(seen) >= 6 else info
+        for info in updates(learner, *args):
+            yield info | {"critic_loss": torch.tensor(np.nan)} if next(seen) >= 6 else info
 
     with monkeypatch.context() as patch:
-        patch.setattr(Learner, "update", diverge)
+        patch.setattr(Learner, "updates", diverge)
         with pytest.raises(DataError, match=r"critic_loss is nan after 8 updates: .* diverged"):
             run_pretraining(config)
     assert (tmp_path / "checkpoints/last").resolve().name == "000004"
