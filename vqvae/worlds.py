@@ -60,12 +60,12 @@ class ImageWorlds(Worlds):
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return all that ``restore_snapshot`` needs to go on from here."""
-        return super().snapshot() | {"place": self.place}
+        return super().snapshot() | {"place": self.place.copy()}
 
     def restore_snapshot(self, arrays: dict[str, np.ndarray]) -> None:
         """Go on from a snapshot."""
         super().restore_snapshot(arrays)
-        self.place, self._seen = arrays["place"], None
+        self.place, self._seen = arrays["place"].copy(), None
 
     def images(self) -> np.ndarray:
         """Return what the camera sees, (N, H, W, 3) uint8."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, ClassVar
 
@@ -11,21 +10,19 @@ from gymnasium import spaces
 from gymnasium_robotics.core import GoalEnv
 
 from eisp_data.errors import ConfigError
-from eisp_data.sim.render import Renderer
+from eisp_data.sim.render import Renderer, check_camera
 from eisp_data.sim.scene import CONTROL_HZ
 from eisp_data.sim.worlds import Worlds
 from eisp_data.tasks.base import compute_reward
 from eisp_data.tasks.registry import get_task
-
-Info = Mapping[str, Any]
 
 
 class TaskEnv(GoalEnv):
     """The batched worlds with N = 1.
 
     Observations are ``{"observation": (S,), "achieved_goal": (G,), "desired_goal": (G,)}``
-    float32, actions (4,) float32 in [-1, 1]. ``info`` holds ``is_success``, and ``steps`` since
-    the reset. An episode never ends on success, only after the task's L steps.
+    float32, actions (4,) float32 in [-1, 1]. ``info`` holds ``is_success``. An episode never ends
+    by itself: ``gymnasium.make`` cuts it after the task's L steps, or ``max_episode_steps``.
     """
 
     metadata: ClassVar[dict[str, Any]] = {
@@ -51,12 +48,13 @@ class TaskEnv(GoalEnv):
             height: of a frame, pixels.
 
         Raises:
-            ConfigError: no such task or render mode.
+            ConfigError: no such task, render mode or camera.
         """
         modes = self.metadata["render_modes"]
         if render_mode is not None and render_mode not in modes:
             raise ConfigError(f"unknown render_mode {render_mode!r}; choose one of {modes} or None")
         self.task = get_task(task)
+        check_camera(self.task, camera)
         self.render_mode = render_mode
         self.worlds = Worlds(self.task, 1, threads=1)
         self._renderer: Renderer | None = None
@@ -106,12 +104,10 @@ class TaskEnv(GoalEnv):
         return np.zeros(np.shape(achieved_goal)[:-1], bool)
 
     def compute_truncated(
-        self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Info | Sequence[Info]
+        self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any
     ) -> np.ndarray:
-        """Return (...) bool for (..., G) goals: whether the L steps of ``info`` are over."""
-        infos = [info] if isinstance(info, Mapping) else info
-        over = np.array([one.get("steps", 0) >= self.task.paper.episode_steps for one in infos])
-        return np.broadcast_to(over.squeeze(), np.shape(achieved_goal)[:-1])
+        """Return (...) False for (..., G) goals: the ``TimeLimit`` wrapper cuts episodes."""
+        return np.zeros(np.shape(achieved_goal)[:-1], bool)
 
     def render(self) -> np.ndarray | None:
         """Return the current (H, W, 3) uint8 frame with the goals in it, None without a mode."""
@@ -127,6 +123,9 @@ class TaskEnv(GoalEnv):
             self._renderer.close()
             self._renderer = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_renderer": None}
+
     def _observation(self) -> dict[str, np.ndarray]:
         return {
             "observation": self.worlds.observation[0],
@@ -135,10 +134,7 @@ class TaskEnv(GoalEnv):
         }
 
     def _info(self) -> dict[str, Any]:
-        return {
-            "is_success": bool(self.worlds.success[0]),
-            "steps": int(self.worlds.steps[0]),
-        }
+        return {"is_success": bool(self.worlds.success[0])}
 
 
 def _unbounded(dim: int) -> spaces.Box:

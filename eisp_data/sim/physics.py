@@ -8,7 +8,8 @@ import mujoco
 import numpy as np
 from mujoco.rollout import Rollout
 
-from eisp_data.sim.scene import SUBSTEPS
+from eisp_data.errors import DataError
+from eisp_data.sim.scene import SUBSTEPS, TIMESTEP_S
 
 
 def default_threads() -> int:
@@ -28,8 +29,12 @@ class Physics:
         self.model = model
         self.state_dim = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
         threads = default_threads() if threads is None else threads
+        self._threads = threads
         self._data = [mujoco.MjData(model) for _ in range(max(1, threads))]
         self._pool = Rollout(nthread=threads if threads > 1 else 0)
+
+    def __reduce__(self) -> tuple[type[Physics], tuple[mujoco.MjModel, int]]:
+        return Physics, (self.model, self._threads)
 
     def step(self, state: np.ndarray, control: np.ndarray) -> np.ndarray:
         """Apply the controls of one control period in every world.
@@ -40,8 +45,14 @@ class Physics:
 
         Returns:
             (N, P) float64, the states SUBSTEPS time steps later.
+
+        Raises:
+            DataError: a control is not finite, or the physics of a world has broken down. MuJoCo
+                would go on with no control, or from the model's own first state.
         """
         worlds = len(state)
+        if not np.isfinite(control).all():
+            raise DataError(f"world {_first(~np.isfinite(control))}: its control is not finite")
         path = np.empty((worlds, SUBSTEPS, self.state_dim))
         sensors = np.empty((worlds, SUBSTEPS, self.model.nsensordata))
         self._pool.rollout(
@@ -57,4 +68,15 @@ class Physics:
             skip_checks=True,
             initial_warmstart=None,
         )
-        return path[:, -1].copy()
+        ends = path[:, -1].copy()
+        lost = np.abs(ends[:, 0] - state[:, 0] - SUBSTEPS * TIMESTEP_S) > TIMESTEP_S / 2
+        if lost.any():
+            raise DataError(
+                f"world {_first(lost)}: its physics has broken down; is its state sound?"
+            )
+        return ends
+
+
+def _first(where: np.ndarray) -> int:
+    """Return the index along the first axis of the first True."""
+    return int(np.argwhere(where)[0, 0])

@@ -37,10 +37,8 @@ class Renderer:
         Raises:
             ConfigError: no such camera, or there is no OpenGL on this machine.
         """
+        check_camera(task, camera)
         model = task.model
-        cameras = [model.camera(index).name for index in range(model.ncam)]
-        if camera not in cameras:
-            raise ConfigError(f"unknown camera {camera!r}; choose one of {', '.join(cameras)}")
         model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
         model.vis.global_.offheight = max(model.vis.global_.offheight, height)
         self._model, self._data = model, mujoco.MjData(model)
@@ -52,7 +50,7 @@ class Renderer:
         self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + _MARKERS)
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._camera.fixedcamid = cameras.index(camera)
+        self._camera.fixedcamid = model.camera(camera).id
         self._rectangle = mujoco.MjrRect(0, 0, width, height)
 
     def render(
@@ -114,6 +112,13 @@ class Renderer:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def check_camera(task: Task, camera: str) -> None:
+    """Raise ConfigError unless the task's scene has the camera."""
+    cameras = [task.model.camera(index).name for index in range(task.model.ncam)]
+    if camera not in cameras:
+        raise ConfigError(f"unknown camera {camera!r}; choose one of {', '.join(cameras)}")
 
 
 def object_colours(task: Task) -> list[np.ndarray]:

@@ -46,18 +46,23 @@ class Worlds:
         self.steps[indices] = 0
 
     def step(self, action: np.ndarray) -> None:
-        """Apply (N, A) actions for one control period."""
+        """Apply (N, A) actions for one control period.
+
+        Raises:
+            DataError: an action is not finite, or the physics of a world has broken down.
+        """
         self.state = self._physics.step(self.state, self.task.control(self.state, action))
         self.steps += 1
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return all that ``restore_snapshot`` needs to go on from here."""
-        return {"state": self.state, "desired_goal": self.desired_goal, "steps": self.steps}
+        arrays = {"state": self.state, "desired_goal": self.desired_goal, "steps": self.steps}
+        return {name: array.copy() for name, array in arrays.items()}
 
     def restore_snapshot(self, arrays: dict[str, np.ndarray]) -> None:
         """Go on from a snapshot."""
-        self.state, self.desired_goal = arrays["state"], arrays["desired_goal"]
-        self.steps = arrays["steps"]
+        self.state, self.desired_goal = arrays["state"].copy(), arrays["desired_goal"].copy()
+        self.steps = arrays["steps"].copy()
 
     @property
     def name(self) -> str:

@@ -15,6 +15,7 @@ import numpy as np
 from eisp_data.sim.physics import Physics
 from eisp_data.sim.rotation import euler_from_quaternion, rotate
 from eisp_data.sim.scene import (
+    BLOCK_SIZE_M,
     FINGER_TRAVEL_M,
     SUBSTEPS,
     TIMESTEP_S,
@@ -34,6 +35,8 @@ ACTION_SCALE_M = 0.04
 """Displacement commanded by an action of 1: 1 m/s at 25 Hz, the tool speed of a UR3."""
 
 AT_REST_M_S = 0.02
+_LOOSE_M = 0.004
+"""A finger so far from a block is off it."""
 _GRIPPER_JOINTS = 5
 
 
@@ -160,15 +163,18 @@ class Task(ABC):
 
     def hands_off(self, state: np.ndarray) -> np.ndarray:
         """Return whether no block is between the fingers, (N,) bool."""
-        offset = np.abs(self.block_positions(state) - self.qpos(state)[:, None, :3])
-        near = (offset < 0.03).all(axis=-1).any(axis=1)
-        squeezed = self.qpos(state)[:, 3:5].mean(axis=1) < 0.029
-        return ~(near & squeezed)
+        poses = self._block_poses(state)
+        offset = np.abs(poses[..., :3] - self.qpos(state)[:, None, :3])
+        near = (offset < 0.03).all(axis=-1)
+        # The fingers move along y. A block that is turned reaches further along it.
+        y = rotate(poses[..., 3:] * [1, -1, -1, -1], np.array([0.0, 1.0, 0.0]))
+        reach = BLOCK_SIZE_M / 2 * np.abs(y).sum(axis=-1)
+        squeezed = self.qpos(state)[:, 3:5].mean(axis=1, keepdims=True) < reach + _LOOSE_M
+        return ~(near & squeezed).any(axis=1)
 
     def block_positions(self, state: np.ndarray) -> np.ndarray:
         """Return the (N, blocks, 3) positions of the blocks' centres."""
-        start = _GRIPPER_JOINTS + self.fixtures
-        return self.qpos(state)[:, start:].reshape(len(state), self.blocks, 7)[..., :3]
+        return self._block_poses(state)[..., :3]
 
     def qpos(self, state: np.ndarray) -> np.ndarray:
         """Return the view (..., nq) of the joint positions."""
@@ -204,14 +210,18 @@ class Task(ABC):
         """Return the batched physics of this task's scene."""
         return Physics(self.model, threads)
 
+    def _block_poses(self, state: np.ndarray) -> np.ndarray:
+        """Return the (N, blocks, 7) positions and quaternions of the blocks."""
+        start = _GRIPPER_JOINTS + self.fixtures
+        return self.qpos(state)[:, start:].reshape(len(state), self.blocks, 7)
+
     def _block_qvel(self, state: np.ndarray) -> np.ndarray:
         start = _GRIPPER_JOINTS + self.fixtures
         return self.qvel(state)[:, start:].reshape(len(state), self.blocks, 6)
 
     def _block_features(self, state: np.ndarray) -> np.ndarray:
         """Return the (N, blocks, OBJECT_DIM) features of the blocks."""
-        start = _GRIPPER_JOINTS + self.fixtures
-        poses = self.qpos(state)[:, start:].reshape(len(state), self.blocks, 7)
+        poses = self._block_poses(state)
         velocities = self._block_qvel(state)
         position, quaternion = poses[..., :3], poses[..., 3:]
         features = np.empty((len(state), self.blocks, OBJECT_DIM), np.float32)

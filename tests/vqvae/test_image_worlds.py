@@ -85,7 +85,7 @@ def test_the_goal_is_a_picture_of_a_success(worlds):
 def test_a_snapshot_brings_all_back(worlds):
     worlds.reset([3, 4])
     worlds.step(np.ones((2, 4)))
-    kept = {name: value.copy() for name, value in worlds.snapshot().items()}
+    kept = worlds.snapshot()
     seen, goal = worlds.observation, worlds.desired_goal.copy()
     worlds.reset([5, 6])
     worlds.restore_snapshot(kept)

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from eisp_data.errors import DataError
 from eisp_data.policies.registry import SCRIPTS
 from eisp_data.policies.script import Noise, ScriptedPolicy
 from eisp_data.sim.scene import SUBSTEPS
@@ -74,6 +75,35 @@ def test_a_world_does_not_depend_on_the_worlds_and_threads_beside_it(name):
         together.step(action)
         alone.step(action[3:4])
     np.testing.assert_array_equal(together.state[3], alone.state[0])
+
+
+def test_what_is_not_finite_and_what_breaks_down_is_told_not_gone_on_from(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # for MuJoCo's own log
+    task = get_task("stack")
+    worlds = Worlds(task, 3, threads=1)
+    worlds.reset([0, 1, 2])
+    before = worlds.state.copy()
+    action = np.zeros((3, 4), np.float32)
+    action[1, 2] = np.nan
+    with pytest.raises(DataError, match="world 1: its control is not finite"):
+        worlds.step(action)
+    np.testing.assert_array_equal(worlds.state, before)
+    task.qpos(worlds.state)[2, 6] = 1e12
+    with pytest.raises(DataError, match="world 2: its physics has broken down"):
+        worlds.step(np.zeros((3, 4), np.float32))
+
+
+def test_a_snapshot_stays_as_it_was_and_can_be_gone_on_from_twice():
+    worlds = Worlds(get_task("stack"), 2, threads=1)
+    worlds.reset([0, 1])
+    kept, ends = worlds.snapshot(), []
+    for _ in range(2):
+        worlds.step(np.full((2, 4), 0.5, np.float32))
+        worlds.reset([9], np.array([0]))
+        ends.append(worlds.state)
+        worlds.restore_snapshot(kept)
+        np.testing.assert_array_equal(worlds.steps, [0, 0])
+    np.testing.assert_array_equal(*ends)
 
 
 def test_a_tower_rests_for_a_hundred_steps_without_drift():

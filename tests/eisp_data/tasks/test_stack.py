@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
+from eisp_data.sim.worlds import Worlds
 from eisp_data.tasks.base import is_success
 from eisp_data.tasks.registry import get_task
 
@@ -46,3 +48,21 @@ def test_a_held_block_is_not_settled_and_a_released_tower_is():
     states = np.array([task.state_of(away, tower), task.state_of(around, tower)])
     task.qpos(states)[1, 3:5] = 0.025  # the fingers touch the top block on both sides
     np.testing.assert_array_equal(task.settled(states), [True, False])
+
+
+@pytest.mark.parametrize("degrees", [0, 30, 45])
+def test_a_block_that_is_gripped_over_its_corners_is_held_too(degrees):
+    task = get_task("stack")
+    under = np.array([[0.30, 0.0, 0.025], [0.40, 0.10, 0.025], [0.22, 0.12, 0.025]])
+    state = task.state_of(np.array([0.30, 0.0, 0.03]), under)
+    half = np.radians(degrees) / 2
+    task.qpos(state)[8:12] = [np.cos(half), 0, 0, np.sin(half)]
+    worlds = Worlds(task, 1, threads=1)
+    worlds.restore(state[None], np.zeros((1, 9), np.float32))
+    for action in [[0, 0, 0, -1]] * 10 + [[0, 0, 0.3, -1]] * 10 + [[0, 0, 0, -1]] * 10:
+        worlds.step(np.array([action]))
+    assert task.block_positions(worlds.state)[0, 0, 2] > 0.1
+    assert not task.hands_off(worlds.state)[0]
+    for _ in range(20):
+        worlds.step(np.array([[0.0, 0.0, 0.0, 1.0]]))
+    assert task.hands_off(worlds.state)[0]
