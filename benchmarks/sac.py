@@ -98,7 +98,7 @@ class Ours:
         agent = Agent(config, layout, self._data.moments(), torch.zeros(BANK, G))
         set_up("cpu", max(1, options.threads // 2))
         self._learner = Learner(agent, 3e-4, 3e-4, options.threads)
-        self._mix = GoalMix(waypoint=0.0, future=0.8, displaced=0.0, pursued=0.2, horizon=300)
+        self._mix = GoalMix(waypoint=0.0, future=0.8, displaced=0.0, pursued=0.2, horizon=None)
         self._batch_size, self._rng = options.batch_size, rng
 
     def update(self, count: int) -> float:

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from eisp_data.cli.collect import LAST_SEED, episode_seeds
 from eisp_data.collect import explore
 from eisp_data.config import above_zero, at_least, check_seed, load_yaml, zero_to_one
 from eisp_data.errors import ConfigError
-from eisp_data.runs.folder import begin_run, folders_of_run, has_progress
+from eisp_data.runs.folder import begin_run, check_same_dataset, folders_of_run, has_progress
+from eisp_data.seeds import LAST_SEED, episode_seeds
 from eisp_data.sim.gym_worlds import AnyWorlds, GymWorlds
 from eisp_data.sim.worlds import Worlds
 from eisp_data.storage.files import write_json
@@ -33,6 +33,7 @@ from pretrain.train import CONFIG_FILE, gather
 from pretrain.vision import load_seen
 from vqvae.worlds import ImageWorlds
 
+_SETTINGS = "finetune.yaml"
 _FIRST_EPISODES = 100
 """Episodes of random actions before learning from nothing."""
 
@@ -41,7 +42,9 @@ def finetune(config: FinetuneConfig) -> dict[str, float]:
     """Fine-tune an agent; return the summary that is also in ``summary.json`` of the run."""
     run = config.output_dir
     _check(config)
-    resumed = has_progress(run, config.resume, "finetune.yaml")
+    resumed = has_progress(run, config.resume, _SETTINGS)
+    if resumed:
+        _check_same(load_yaml(FinetuneConfig, run / _SETTINGS), config)
     device = set_up(config.device, threads_of_half(config.threads))
     print(describe(device, config.threads), flush=True)
     torch.manual_seed(config.seed)
@@ -69,7 +72,7 @@ def finetune(config: FinetuneConfig) -> dict[str, float]:
     )
     if resumed:
         finetuner.restore()
-    begin_run(run, config, "finetune.yaml")
+    begin_run(run, config, _SETTINGS)
     if config.policy.path and not resumed:
         _keep_history(config.policy.path, run)
     summary = finetuner()
@@ -105,6 +108,26 @@ def _check(config: FinetuneConfig) -> None:
         }
     )
     check_subgoals(config.subgoals, "--subgoals")
+
+
+def _check_same(begun: FinetuneConfig, given: FinetuneConfig) -> None:
+    """Raise ConfigError if a run to resume began with another policy, environment or dataset."""
+    file = given.output_dir / _SETTINGS
+    for flag, was, now in (
+        ("--policy.path", _absolute(begun.policy.path), _absolute(given.policy.path)),
+        ("--env.id", begun.env.id, given.env.id),
+    ):
+        if was != now:
+            raise ConfigError(
+                f"--resume: the run began with {flag} {was}, not {now}; if it has moved, say so in "
+                f"{file}"
+            )
+    if given.policy.path is not None:
+        check_same_dataset(_root(begun), _root(given), file)
+
+
+def _absolute(path: Path | None) -> Path | None:
+    return path and path.resolve()
 
 
 def make_worlds(agent: Agent, count: int) -> AnyWorlds:
@@ -146,20 +169,22 @@ def load_for_rollouts(path: Path | None, subgoals: SubgoalConfig, device: str) -
 
 def _dataset(config: FinetuneConfig, agent: Agent) -> Trajectories:
     """Return all episodes of the dataset that the agent was pretrained on."""
-    root = config.dataset.root
-    if root is None:
-        root = _pretraining_dataset(config.policy.path)
-        if not root.exists():
-            raise ConfigError(
-                f"{config.policy.path} was pretrained on {root}, which is not there; give "
-                "--dataset.root"
-            )
+    root = _root(config)
+    if config.dataset.root is None and not root.exists():
+        raise ConfigError(
+            f"{config.policy.path} was pretrained on {root}, which is not there; give "
+            "--dataset.root"
+        )
     arrays = load_seen(root, agent.config, agent.vision)
     every = np.arange(arrays.num_episodes)
     return gather(arrays, every, agent.layout, agent.config.waypoints)
 
 
-def _pretraining_dataset(path: Path | None) -> Path:
+def _root(config: FinetuneConfig) -> Path:
+    """Return the dataset of a run: its own, or that which its policy was pretrained on."""
+    if config.dataset.root is not None:
+        return config.dataset.root
+    path = config.policy.path
     assert path is not None
     for folder in folders_of_run(path):
         if (folder / CONFIG_FILE).exists():

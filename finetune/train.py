@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from eisp_data.errors import ConfigError, DataError
 from eisp_data.runs.metrics import MetricsLog, Speeds
+from eisp_data.seeds import SELECTION_SEED, first_online_seed
 from eisp_data.sim.gym_worlds import AnyWorlds
 from finetune.config import OnlineConfig
 from finetune.evaluate import Evaluation, evaluate
@@ -32,10 +33,6 @@ from pretrain.replay import Trajectories
 from pretrain.sac import Batch
 from pretrain.saved import POLICY
 
-_SELECTION_SEED = 500_000_000
-"""Seeds from here on choose among checkpoints; none of them is ever reported on."""
-_TRAINING_SEED = 1_000_000_000
-"""Seeds from here on are the worlds that are learned in."""
 _CONFIRMING = 3
 """A policy that looks best is tried on so many times the episodes of an evaluation more: the best
 of many evaluations has been lucky, too."""
@@ -163,7 +160,7 @@ class Finetuner:
         self._rollouts = Rollouts(
             worlds,
             policy,
-            _TRAINING_SEED + seed * 10_000_000,
+            first_online_seed(seed),
             np.zeros(config.worlds, bool),
         )
         self._evaluation_worlds = make_worlds(min(100, config.evaluation_episodes))
@@ -253,7 +250,7 @@ class Finetuner:
         return result
 
     def _try(self, first: int, count: int) -> Evaluation:
-        return evaluate(self.agent, self._evaluation_worlds, count, _SELECTION_SEED + first)
+        return evaluate(self.agent, self._evaluation_worlds, count, SELECTION_SEED + first)
 
     def _choose(self, result: Evaluation) -> None:
         """Keep the policy as the best if it is, on the episodes of this evaluation and on more."""

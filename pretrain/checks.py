@@ -38,13 +38,20 @@ def check_pretrain(config: PretrainConfig) -> None:
         {
             "--agent.sac.lr": config.agent.sac.lr,
             "--generator-lr": config.generator_lr,
+            "--agent.sac.tau": config.agent.sac.tau,
             "--agent.mix.tolerance-m": config.agent.mix.tolerance_m,
         }
     )
     at_least(
         0,
         {
+            "--agent.sac.alpha": config.agent.sac.alpha,
             "--agent.sac.cloning": config.agent.sac.cloning,
+            "--agent.hybrid.beta": config.agent.hybrid.beta,
+            "--agent.movers.likelihood": config.agent.movers.likelihood,
+            "--agent.movers.reconstruction": config.agent.movers.reconstruction,
+            "--agent.movers.divergence": config.agent.movers.divergence,
+            "--agent.movers.temperature": config.agent.movers.temperature,
             "--agent.mix.errors": config.agent.mix.errors,
         },
     )
@@ -74,6 +81,7 @@ def check_subgoals(config: SubgoalConfig, flag: str) -> None:
     at_least(
         1, {f"{flag}.candidates": config.candidates, f"{flag}.every-steps": config.every_steps}
     )
+    at_least(0, {f"{flag}.reached-m": config.reached_m, f"{flag}.final-m": config.final_m})
 
 
 def _check_mix(mix: GoalMix) -> None:
@@ -81,6 +89,6 @@ def _check_mix(mix: GoalMix) -> None:
     if min(parts) < 0 or not abs(sum(parts) - 1) <= _ROUNDING:
         said = ", ".join(map(str, parts))
         raise ConfigError(
-            "--agent.mix: the shares of waypoint, future, displaced and pursued goals must add up "
-            f"to 1; got {said}"
+            "--agent.mix: the shares of waypoint, future, displaced and pursued goals must be at "
+            f"least 0 and add up to 1; got {said}"
         )

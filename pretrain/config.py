@@ -109,8 +109,9 @@ class GoalMix:
     furthest: float = 0.5
     """Share of the others that lead to the furthest waypoint that is no detour, for far goals are
     what subgoals are for; the rest lead to any on the way there."""
-    horizon: int = 40
-    """How many steps later a ``future`` goal may lie."""
+    horizon: int | None = 40
+    """How many steps later a ``future`` goal may lie; None: uniformly until the end of the
+    trajectory, as in hindsight experience replay (Andrychowicz et al. 2017)."""
     tolerance_m: float = 0.05
     """epsilon of Eq. (1) for these goals: tighter than the task's, because errors add up."""
     errors: float = 0.5

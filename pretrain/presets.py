@@ -117,7 +117,7 @@ def _paper(task: str, root: Path, output_dir: Path) -> PretrainConfig:
                 displaced=0.0,
                 complete=0.0,
                 furthest=1.0,
-                horizon=table.episode_steps,
+                horizon=None,
                 errors=0.0,
             ),
         ),

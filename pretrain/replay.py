@@ -110,7 +110,7 @@ class Trajectories:
             rows[lead] = self._guiding[rng.integers(len(self._guiding), size=int(lead.sum()))]
         else:
             kind[kind == 0] = 1
-        future = np.minimum(rows + rng.integers(1, mix.horizon + 1, size=count), self._last[rows])
+        future = self._later(rows, mix.horizon, rng)
         source = np.where(kind == 0, self._next_rest[rows], future)
         goal = self.achieved_goal.take(source, 0)
         self._displace(goal, rows, kind == 2, rng)
@@ -132,6 +132,12 @@ class Trajectories:
             clone=torch.from_numpy(clone.astype(np.float32)),
             demonstrated=torch.full((count,), float(self._purposeful)),
         )
+
+    def _later(self, rows: np.ndarray, horizon: int | None, rng: np.random.Generator) -> np.ndarray:
+        """Return for each row one that comes after it, see ``GoalMix.horizon``."""
+        if horizon is None:
+            return rng.integers(rows + 1, self._last[rows] + 1)
+        return np.minimum(rows + rng.integers(1, horizon + 1, size=len(rows)), self._last[rows])
 
     def _displace(
         self, goal: np.ndarray, rows: np.ndarray, chosen: np.ndarray, rng: np.random.Generator

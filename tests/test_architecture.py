@@ -1,9 +1,11 @@
 """What holds for the repository as a whole."""
 
 import ast
+import re
 import subprocess
 import sys
 import tomllib
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
@@ -11,6 +13,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("eisp_data", "vqvae", "pretrain", "finetune")
 HEAVY = {"torch", "lerobot", "cv2", "datasets"}
+WITHOUT_METADATA = ("coal", "pinocchio", "rerun", "rtde_control", "rtde_receive")
+"""Of ``pin``, which does not say what it provides, and of extras that need not be installed."""
 COMMANDS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 
 
@@ -42,6 +46,21 @@ def test_data_flow_one_way(package):
     for path in modules:
         wrong = imported_packages(path) & right_of_it
         assert not wrong, f"{path.relative_to(ROOT)} imports {sorted(wrong)}"
+
+
+def test_whatever_is_imported_is_declared():
+    """A package that only another one brings may be gone, or older, with its next release."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    optional = project["optional-dependencies"].values()
+    wanted = [*project["dependencies"], *(line for extra in optional for line in extra)]
+    declared = {re.split(r"[^\w-]", line)[0].lower() for line in wanted}
+    modules = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
+    imported = set().union(*map(imported_packages, modules))
+    of_others = imported - set(sys.stdlib_module_names) - set(PACKAGES) - set(WITHOUT_METADATA)
+    provided = packages_distributions()
+    for name in of_others:
+        names = {one.lower().replace("_", "-") for one in provided.get(name, ())}
+        assert names & declared, f"{name}, of {sorted(names)}, is not in pyproject.toml"
 
 
 def test_datasets_is_no_package_for_it_would_hide_the_one_that_lerobot_imports():

@@ -45,13 +45,18 @@ class Codebook(nn.Module):
     @torch.no_grad()
     def nearest(self, vectors: Tensor) -> Tensor:
         """Return the indices (N,) of the codes nearest to (N, D) vectors."""
-        # |v|^2 is the same for all codes.
-        square = self.code.square().sum(1)
-        parts = [
-            torch.addmm(square, part, self.code.T, alpha=-2.0).argmin(1)
-            for part in vectors.split(_ROWS)
-        ]
-        return torch.cat(parts)
+        return torch.cat([self._apart(part).argmin(1) for part in vectors.split(_ROWS)])
+
+    def _apart(self, vectors: Tensor) -> Tensor:
+        """Return the squared distances (N, K) of (N, D) vectors and all codes.
+
+        Without a product of matrices, which may be of less than fp32 (``pretrain.device``): the
+        codes of an image must be the same wherever it is encoded. It takes no longer either.
+        """
+        squares = vectors.new_zeros(len(vectors), len(self))
+        for mine, theirs in zip(vectors.T, self.code.T, strict=True):
+            squares += (mine[:, None] - theirs).square_()
+        return squares
 
     def forward(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
         """Return the codes (N, D) nearest to (N, D) vectors, and their indices (N,).

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from eisp_data.config import above_zero, at_least, check_seed, load_yaml
+from eisp_data.config import above_zero, at_least, check_seed, load_yaml, zero_to_one
 from eisp_data.errors import ConfigError, DataError
 from eisp_data.runs import MODEL, checkpoint
 from eisp_data.runs.device import choose_device
@@ -157,7 +157,8 @@ def check(config: VqVaeTrainConfig) -> None:
     above_zero({"--lr": config.lr})
     if model.codes > _MOST_CODES:
         raise ConfigError(f"--model.codes must be at most {_MOST_CODES}; got {model.codes}")
-    at_least(0, {"--model.reading": model.reading})
+    at_least(0, {"--model.reading": model.reading, "--model.commitment": model.commitment})
+    zero_to_one({"--final-lr-share": config.final_lr_share})
     for flag, share in (
         ("--validation-share", config.validation_share),
         ("--model.decay", model.decay),

@@ -13,6 +13,7 @@ from eisp_data.cli.run import fail, run
 from eisp_data.cli.words import given, take
 from eisp_data.config import at_least, load_yaml
 from eisp_data.errors import ConfigError, EispError
+from eisp_data.seeds import LAST_SEED, SEEDS_APART, episode_seeds
 
 if TYPE_CHECKING:
     from eisp_data.episode import Episode
@@ -21,10 +22,6 @@ if TYPE_CHECKING:
 
 _BATCH = 50
 """Episodes that are written at a time, and so the most that a kill loses."""
-SEEDS_APART = 1_000_000
-"""How many seeds each dataset has; the first as many are left to evaluations."""
-LAST_SEED = 498
-"""Datasets' seeds end where those of learning online begin, see ``finetune.train``."""
 CONFIG_FILE = "meta/collect.yaml"
 """In the dataset; give it back with ``--config`` and another ``--output-dir``."""
 _NOT_OF_THE_DATA = ("output_dir", "resume")
@@ -109,15 +106,6 @@ def collect(config: CollectConfig) -> None:
             with tqdm(desc="collecting", total=config.episodes, initial=done, unit="ep") as bar:
                 _write(writer, source.episodes(seeds), bar)
     _report(config.output_dir)
-
-
-def episode_seeds(seed: int, start: int, stop: int) -> range:
-    """Return the seeds of episodes ``start`` to ``stop - 1`` of a dataset.
-
-    Those below 1,000,000 are left to evaluations, whose episodes must not have been learned from.
-    """
-    first = (seed + 1) * SEEDS_APART
-    return range(first + start, first + stop)
 
 
 def missing_seeds(seed: int, present: Sequence[int], episodes: int) -> list[int]:

@@ -21,6 +21,7 @@ from safetensors.torch import load_file
 import finetune.train as finetune_train
 from eisp_data.cli.collect import CollectConfig, collect
 from eisp_data.errors import ConfigError, DataError
+from eisp_data.seeds import SELECTION_SEED
 from eisp_data.sim.gym_worlds import GymWorlds
 from finetune.config import DataConfig, EnvConfig, FinetuneConfig, OnlineConfig, PolicyConfig
 from finetune.evaluate import Evaluation
@@ -189,7 +190,7 @@ def test_the_policy_that_is_best_on_all_episodes_is_kept(pretrained, tmp_path, m
     said, asked, real = iter([0.2, 0.2, 0.8, 0.9, 1.0, 0.8]), [], finetune_train.evaluate
 
     def evaluate(*args: object, **options: object) -> Evaluation:
-        asked.append((args[3] - finetune_train._SELECTION_SEED, args[2]))  # type: ignore[operator]
+        asked.append((args[3] - SELECTION_SEED, args[2]))  # type: ignore[operator]
         result = real(*args, **options)  # type: ignore[arg-type]
         return replace(result, success_last=replace(result.success_last, mean=next(said)))
 
@@ -266,6 +267,21 @@ def test_what_cannot_be_resumed_is_told_and_changes_nothing(finished, tmp_path, 
     assert (tmp_path / "run/finetune.yaml").read_text() == before
     finetune(config)
     assert_same_run(tmp_path / "run", finished)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"dataset": DataConfig(Path("other"))}, r"the run learns from .*, not from other; if"),
+        ({"policy": PolicyConfig(Path("other"))}, r"began with --policy\.path .*, not .*other; if"),
+        ({"env": EnvConfig("FetchReach-v4")}, r"began with --env\.id None, not FetchReach-v4; if"),
+    ],
+)
+def test_a_run_goes_on_with_what_it_began_with(finished, tmp_path, pretrained, changes, said):
+    shutil.copytree(finished, tmp_path / "run", symlinks=True)
+    config = replace(tiny_finetuning(pretrained, tmp_path / "run"), resume=True, **changes)
+    with pytest.raises(ConfigError, match=said):
+        finetune(config)
 
 
 def test_a_policy_of_a_recording_with_arrays_of_its_own_is_told_from_the_tasks():

@@ -12,7 +12,14 @@ from eisp_data.errors import ConfigError
 from eisp_data.tasks.base import SUCCESS_DISTANCE_M
 from eisp_data.tasks.registry import TASKS
 from pretrain.checks import check_pretrain
-from pretrain.config import GoalMix, HybridConfig, MoversConfig, PretrainConfig, SacConfig
+from pretrain.config import (
+    GoalMix,
+    HybridConfig,
+    MoversConfig,
+    PretrainConfig,
+    SacConfig,
+    SubgoalConfig,
+)
 from pretrain.layout import Layout
 from pretrain.presets import preset
 from pretrain.replay import Trajectories
@@ -88,12 +95,19 @@ def test_another_environment_gets_what_needs_no_objects_and_no_rest():
             {"mix": GoalMix(0.3333333, 0.3333333, 0.3333333)},
             "--agent.mix: .* add up to 1; got 0.333",
         ),
-        ({"mix": GoalMix(1.5, -0.5, 0.0)}, "--agent.mix: .* add up to 1; got 1.5, -0.5, 0.0"),
+        (
+            {"mix": GoalMix(1.2, -0.2, 0.0)},
+            "--agent.mix: .* at least 0 and .*; got 1.2, -0.2",
+        ),
         ({"waypoints": 0}, "--agent.waypoints must be at least 1; got 0"),
         ({"candidates": 0}, "--agent.subgoals.candidates must be at least 1; got 0"),
         ({"sac": SacConfig(layers=())}, "--agent.sac.layers must be one or more sizes"),
         ({"sac": SacConfig(lr=-1.0)}, "--agent.sac.lr must be above 0; got -1.0"),
         ({"sac": SacConfig(tau=5.0)}, "--agent.sac.tau must be 0 to 1; got 5.0"),
+        ({"sac": SacConfig(tau=0.0)}, "--agent.sac.tau must be above 0; got 0.0"),
+        ({"sac": SacConfig(alpha=-1.0)}, "--agent.sac.alpha must be at least 0; got -1.0"),
+        ({"movers": MoversConfig(likelihood=-1.0)}, "--agent.movers.likelihood must be at least 0"),
+        ({"subgoals": SubgoalConfig(reached_m=float("nan"))}, "--agent.subgoals.reached-m must be"),
         ({"movers": MoversConfig(modes=0)}, "--agent.movers.modes must be at least 1; got 0"),
         ({"hybrid": HybridConfig(layers=(0,))}, "--agent.hybrid.layers must be one or more"),
         ({"mix": GoalMix(complete=2.0)}, "--agent.mix.complete must be 0 to 1; got 2.0"),

@@ -128,10 +128,25 @@ def test_a_future_goal_is_achieved_within_the_horizon():
     data = trajectories()
     _, rows, goal = draw(data, FUTURE)
     assert rows_of(data, goal, rows).all()
+    assert FUTURE.horizon is not None
     near = np.minimum(rows + FUTURE.horizon, last_row(data, rows))
     distance = np.abs(goal - data.achieved_goal[rows]).max(1)
     most = np.abs(data.achieved_goal[near] - data.achieved_goal[rows]).max(1)
     assert (distance <= most + 2e-5).all()
+
+
+def test_without_a_horizon_a_future_goal_is_any_later_row_of_the_trajectory_alike():
+    data = trajectories(([(0, 30)], [(1, 30)]))
+    shares = []
+    for seed in range(20):
+        _, rows, goal = draw(data, replace(FUTURE, horizon=None), seed)
+        found = np.abs(data.achieved_goal[:, None] - goal).max(-1).argmin(0)
+        assert (rows < found).all() and (found <= last_row(data, rows)).all()
+        shares.append((found - rows) / (last_row(data, rows) - rows))
+    # Of n later rows the k-th: k / n is (n + 1) / 2n on average.
+    _, rows, _ = draw(data, FUTURE)
+    left = last_row(data, rows) - rows
+    assert np.mean(shares) == pytest.approx(((left + 1) / (2 * left)).mean(), abs=0.02)
 
 
 def test_a_displaced_goal_moves_one_object_to_where_it_lay_at_another_time():

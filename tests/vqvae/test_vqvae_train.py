@@ -192,6 +192,8 @@ def test_the_learning_rate_falls_to_its_share():
         ({"validation_share": 1.0}, "--validation-share must be between 0 and 1; got 1.0"),
         ({"model": replace(TINY, image_size=(48, 50))}, "multiples of 8; got 48 x 50"),
         ({"model": replace(TINY, reading=-1.0)}, "--model.reading must be at least 0; got -1.0"),
+        ({"model": replace(TINY, commitment=-1.0)}, "--model.commitment must be at least 0; got"),
+        ({"final_lr_share": -1.0}, "--final-lr-share must be 0 to 1; got -1.0"),
         ({"model": replace(TINY, codes=0)}, "--model.codes must be at least 1; got 0"),
         ({"model": replace(TINY, codes=70000)}, "--model.codes must be at most 65536; got 70000"),
         ({"lr": float("nan")}, "--lr must be above 0; got nan"),
