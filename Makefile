@@ -1,7 +1,7 @@
 # make demo      from nothing to an evaluated policy, in .venv (made if it is missing)
 # make test      the whole test suite
 # make lint      formatting, lint and types
-# make bench     speed, each number against the tool that one would use instead
+# make bench     speed and accuracy, against the tool that one would use instead where there is one
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 PYTEST_FLAGS ?=

@@ -1,4 +1,4 @@
-"""Make everything in this folder but the recipes anew: ``python datasets/refresh.py [NAME ...]``.
+"""Make all in this folder but recipes and policies anew: ``python datasets/refresh.py [NAME ...]``.
 
 To be run, and its output committed, whenever a scene, a task, a script or its noise has changed.
 For each recipe it writes the expected statistics, the card and the picture of the first 100

@@ -10,7 +10,7 @@ import numpy as np
 
 from eisp_data.episode import Episode, Scalar
 from eisp_data.policies.script import Noise, Script, ScriptedPolicy
-from eisp_data.sim.gym_worlds import GymWorlds
+from eisp_data.sim.gym_worlds import AnyWorlds, GymWorlds
 from eisp_data.sim.worlds import Worlds
 from eisp_data.tasks.base import Task, is_success
 
@@ -51,13 +51,13 @@ def collect(
     return record(batch, actor, seeds, {"policy": "scripted", **asdict(noise)})
 
 
-def explore(worlds: Worlds | GymWorlds, seeds: Sequence[int]) -> Iterator[Episode]:
+def explore(worlds: AnyWorlds, seeds: Sequence[int]) -> Iterator[Episode]:
     """Yield one Episode of random actions for each seed, in the order of the seeds."""
     return record(worlds, _RandomActor(worlds), seeds, {"policy": "random"})
 
 
 def record(
-    worlds: Worlds | GymWorlds, actor: Actor, seeds: Sequence[int], info: Mapping[str, Scalar]
+    worlds: AnyWorlds, actor: Actor, seeds: Sequence[int], info: Mapping[str, Scalar]
 ) -> Iterator[Episode]:
     """Yield what the actor does, one Episode for each seed, in the order of the seeds.
 
@@ -115,7 +115,7 @@ class _ScriptActor:
 class _RandomActor:
     """Uniform actions, in each world from a stream of its own."""
 
-    def __init__(self, worlds: Worlds | GymWorlds) -> None:
+    def __init__(self, worlds: AnyWorlds) -> None:
         self._streams = [np.random.default_rng() for _ in range(worlds.count)]
         self._action_dim = worlds.action_dim
         self.finished = np.zeros(worlds.count, bool)
@@ -132,7 +132,7 @@ class _RandomActor:
 class _Seen:
     """All worlds after one step."""
 
-    def __init__(self, worlds: Worlds | GymWorlds) -> None:
+    def __init__(self, worlds: AnyWorlds) -> None:
         self.state = worlds.state.copy()
         self.done = worlds.done.copy()
         self.truncated = worlds.truncated.copy()
@@ -145,7 +145,7 @@ class _Seen:
 class _Recorder:
     """One episode in progress."""
 
-    def __init__(self, worlds: Worlds | GymWorlds, world: int, order: int, seed: int) -> None:
+    def __init__(self, worlds: AnyWorlds, world: int, order: int, seed: int) -> None:
         self.order, self.idle = order, 0
         self._world, self._seed = world, seed
         self._goal = worlds.desired_goal[world].copy()
@@ -161,7 +161,7 @@ class _Recorder:
     def _column(self, name: str) -> np.ndarray:
         return np.stack([getattr(seen, name)[self._world] for seen in self._seen])
 
-    def episode(self, worlds: Worlds | GymWorlds, info: Mapping[str, Scalar]) -> Episode:
+    def episode(self, worlds: AnyWorlds, info: Mapping[str, Scalar]) -> Episode:
         """Return the whole of it."""
         state = self._column("state")
         if isinstance(worlds, Worlds):

@@ -1,7 +1,6 @@
 """What holds for the repository as a whole."""
 
 import ast
-import re
 import subprocess
 import sys
 import tomllib
@@ -9,6 +8,7 @@ from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("eisp_data", "vqvae", "pretrain", "finetune")
@@ -53,7 +53,7 @@ def test_whatever_is_imported_is_declared():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     optional = project["optional-dependencies"].values()
     wanted = [*project["dependencies"], *(line for extra in optional for line in extra)]
-    declared = {re.split(r"[^\w-]", line)[0].lower() for line in wanted}
+    declared = {Requirement(line).name.lower() for line in wanted}
     modules = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
     imported = set().union(*map(imported_packages, modules))
     of_others = imported - set(sys.stdlib_module_names) - set(PACKAGES) - set(WITHOUT_METADATA)
