@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from eisp_data.errors import ConfigError
+
 SEEDS_APART = 1_000_000
 """How many seeds each dataset has; the first as many are left to evaluations."""
 LAST_SEED = 498
@@ -16,6 +18,15 @@ def episode_seeds(seed: int, start: int, stop: int) -> range:
     """Return the seeds of episodes ``start`` to ``stop - 1`` of a dataset."""
     first = (seed + 1) * SEEDS_APART
     return range(first + start, first + stop)
+
+
+def check_unlearned(seed: int, episodes: int) -> None:
+    """Raise ConfigError unless these episodes are left to evaluations."""
+    if seed + episodes > SEEDS_APART:
+        raise ConfigError(
+            f"--seed: episodes from {SEEDS_APART} on are learned from; got {seed} and {episodes} "
+            "episodes"
+        )
 
 
 def first_online_seed(seed: int) -> int:

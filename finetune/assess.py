@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import sys
 
-from eisp_data.cli.collect import SEEDS_APART
 from eisp_data.config import at_least, check_seed
 from eisp_data.errors import ConfigError
-from eisp_data.storage.files import check_writable
+from eisp_data.seeds import check_unlearned
+from eisp_data.storage.files import check_writable, one_line
 from eisp_data.tasks.images import state_task
 from eisp_data.tasks.registry import TASKS
 from finetune.config import EvaluateConfig
@@ -26,11 +26,7 @@ def assess(config: EvaluateConfig) -> Evaluation:
     """Evaluate a policy, and film its first episode if asked to and if this machine can."""
     at_least(1, {"--episodes": config.episodes, "--threads": config.threads})
     check_seed(config.seed)
-    if config.seed + config.episodes > SEEDS_APART:
-        raise ConfigError(
-            f"--seed: episodes from {SEEDS_APART} on are learned from; got {config.seed} and "
-            f"{config.episodes} episodes"
-        )
+    check_unlearned(config.seed, config.episodes)
     check_subgoals(config.subgoals, "--subgoals")
     device = set_up(config.device, config.threads)
     agent = load_for_rollouts(config.policy.path, config.subgoals, device)
@@ -51,6 +47,6 @@ def assess(config: EvaluateConfig) -> Evaluation:
     if config.video:
         try:
             film.write(config.video)
-        except ConfigError as error:  # no OpenGL: that is no reason to lose the figures
-            print(f"no film: {error}", file=sys.stderr)
+        except Exception as error:  # no OpenGL, a full disk: no reason to lose the figures
+            print(f"no film: {one_line(error)}", file=sys.stderr)
     return result

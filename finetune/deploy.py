@@ -16,6 +16,8 @@ from eisp_data.robots.session import Ended
 from eisp_data.robots.session_cell import Cell
 from eisp_data.robots.session_run import Plan, Report, run_session
 from eisp_data.robots.session_view import Seen
+from eisp_data.seeds import check_unlearned
+from eisp_data.sim.scene import CONTROL_HZ
 from eisp_data.storage.files import replace_atomically
 from eisp_data.tasks.base import SUCCESS_DISTANCE_M, Task
 from eisp_data.tasks.registry import get_task
@@ -46,7 +48,6 @@ _MAY_DIFFER = {
     "threads",
 }
 """Settings that do not decide how an episode goes."""
-_STEP_S = 0.04
 _LOOKS = 2.5
 """With looks an episode may take so many times as long as the policy's steps alone."""
 _SETTLE_S = 0.5
@@ -66,8 +67,10 @@ class _Run:
     lines: list[str] = field(default_factory=list)
 
     def controller(self, cell: Cell) -> Controller:
-        """Return who decides, once the robot is connected."""
+        """Return who decides, once robot and camera have proved usable; the settings are saved,
+        for now there will be something to go on with."""
         self.cell = cell
+        _save_settings(self.config)
         if self.config.interference:
             self.hand = Hand(cell.referee, self.task)
         found: Controller
@@ -127,17 +130,15 @@ class _Run:
             self._note(entry)
 
 
-def deploy(config: DeployConfig) -> None:
+def deploy(config: DeployConfig) -> Report:
     """Run a policy on a robot, and print what became of it, also if it ended in an error."""
     task, agent = _prepare(config)
     first = _done_before(config)
     report = Report(_free_name(config.output_dir, first))
     run = _Run(config, task, agent, report, first)
-    config.output_dir.mkdir(parents=True, exist_ok=True)
-    save_yaml(replace(config, resume=False), config.output_dir / SETTINGS)
     if first >= config.episodes:
         print("\n".join(_verdict(config)))
-        return
+        return report
     try:
         run_session(config, _plan(run), run.controller, report, run.watch, run.after)
     except RobotError as error:
@@ -149,6 +150,7 @@ def deploy(config: DeployConfig) -> None:
         if report.stats is not None:
             _draw(run)
     print("\n".join(_verdict(config)))
+    return report
 
 
 def policy_controller(path: Path | None, task: Task) -> Controller:
@@ -180,6 +182,8 @@ def _prepare(config: DeployConfig) -> tuple[Task, Agent | None]:
         },
     )
     check_seed(config.seed)
+    if config.robot == "twin":
+        check_unlearned(config.seed, config.episodes)
     if config.episode_s is not None and not 0 < config.episode_s < float("inf"):
         raise ConfigError(f"--episode-s must be above 0; got {config.episode_s}")
     if config.task is None:
@@ -230,6 +234,11 @@ def _check_same(config: DeployConfig, begun: DeployConfig) -> None:
         )
 
 
+def _save_settings(config: DeployConfig) -> None:
+    config.output_dir.mkdir(parents=True, exist_ok=True)
+    save_yaml(replace(config, resume=False), config.output_dir / SETTINGS)
+
+
 def _free_name(folder: Path, first: int) -> Path:
     """Return where to record the episodes from this one on: an episode that a fault cut off has
     left a recording and may have left no result."""
@@ -249,7 +258,7 @@ def _plan(run: _Run) -> Plan:
     return Plan(
         run.report.output,
         config.episodes - run.first,
-        _STEP_S * steps if config.episode_s is None else config.episode_s,
+        steps / CONTROL_HZ if config.episode_s is None else config.episode_s,
         config.pause_s,
         metadata,
         run.first,

@@ -21,11 +21,13 @@ from finetune.results import HEAD, percent, result_rows, signed
 from finetune.video import middle_frame
 
 REPORT = "report.html"
-_LEAD = (
-    '<p class="lead">A policy that proposes subgoals on the way to a far goal, and reaches them '
-    "one by one. It was pretrained offline on recorded episodes, then fine-tuned online in "
-    "simulation.</p>"
+_LEAD = "A policy that proposes subgoals on the way to a far goal, and reaches them one by one."
+_OURS = (
+    "Success is the paper's Eq. (1): the whole goal error is at most 5 cm. The return is minus the "
+    "number of steps at which it is not. Relative to the oracle, 0% is never successful and 100% "
+    "is as quick as the script."
 )
+_FOREIGN = "Success and rewards are the environment's own; the return is the sum of the rewards."
 _BLUE, _TEAL, _RED = "#2563eb", "#0d9488", "#dc2626"
 _PAPER, _ORACLE = "#b45309", "#15803d"
 _PRETRAIN, _FINETUNE = "#ede9fe", "#f1f5f9"
@@ -42,6 +44,8 @@ class Run:
     configs: dict[str, str]
     """File name to text."""
     video: bytes | None
+    empty: list[str]
+    """Names of the evaluations whose files have nothing in them."""
 
     @property
     def task(self) -> str:
@@ -76,18 +80,21 @@ def read_run(folder: Path) -> Run:
     if not folder.is_dir():
         raise ConfigError(f"{folder}: no such folder")
     video = folder / "episode.mp4"
+    before, after = folder / "evaluation_before.json", folder / "evaluation_after.json"
+    empty = [path.name for path in (before, after) if path.exists() and not _text(path)]
     run = Run(
         folder=folder,
         metrics=read_metrics(folder / "metrics.jsonl"),
-        before=_read_evaluation(folder / "evaluation_before.json"),
-        after=_read_evaluation(folder / "evaluation_after.json"),
+        before=_read_evaluation(before),
+        after=_read_evaluation(after),
         configs={path.name: path.read_text() for path in sorted(folder.glob("*.yaml"))},
         video=video.read_bytes() if video.exists() else None,
+        empty=empty,
     )
     if not (run.metrics or run.before or run.after):
         raise ConfigError(
-            f"{folder} holds nothing to report on: no metrics.jsonl, evaluation_before.json or "
-            "evaluation_after.json"
+            f"{folder} holds nothing to report on: metrics.jsonl, evaluation_before.json and "
+            "evaluation_after.json are missing or empty"
         )
     return run
 
@@ -100,7 +107,7 @@ def render(run: Run) -> str:
         title,
         [
             f"<h1>{page.escape(title)}</h1>",
-            _LEAD,
+            _lead(run),
             page.cards(_cards(run)),
             _results(run),
             _video(run),
@@ -128,15 +135,20 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
 
 
 def _read_evaluation(path: Path) -> dict[str, Any] | None:
-    if not path.exists():
+    text = _text(path)
+    if not text:
         return None
     try:
-        evaluation = json.loads(path.read_text())
+        evaluation = json.loads(text)
     except ValueError as error:
         raise DataError(f"{path}: not JSON ({error})") from None
     if not isinstance(evaluation, dict) or "success_last" not in evaluation:
         raise DataError(f"{path}: not an evaluation, success_last is missing")
     return evaluation
+
+
+def _text(path: Path) -> str:
+    return path.read_text().strip() if path.exists() else ""
 
 
 def _cards(run: Run) -> list[tuple[str, str]]:
@@ -157,15 +169,26 @@ def _cards(run: Run) -> list[tuple[str, str]]:
     return entries
 
 
+def _lead(run: Run) -> str:
+    """Return what the page is about, and how that was learned as far as the metrics say."""
+    offline, online = (run.stage(name, "updates") for name in ("pretrain", "finetune"))
+    learned = ["pretrained offline on recorded episodes"] if offline else []
+    if online:
+        learned.append(f"{'fine-tuned' if offline else 'trained'} online in simulation")
+    said = f" It was {', then '.join(learned)}." if learned else ""
+    return f'<p class="lead">{_LEAD}{said}</p>'
+
+
 def _results(run: Run) -> str:
     known = run.after or run.before
+    # As the shell leaves the file of an eisp-eval that has not come to its end.
+    left_out = "".join(f" {name} is empty: its eisp-eval has not finished." for name in run.empty)
     if known is None:
-        return page.section("Results", "There is no evaluation in this run.")
+        return page.section("Results", "There is no evaluation in this run." + left_out)
+    meaning = _FOREIGN if known.get("oracle_return") is None else _OURS
     text = (
         f"Over {known['episodes']} fresh episodes, seeds {known['seed']} and up, none of them "
-        "learned from. Success is the paper's Eq. (1): the whole goal error is at most 5 cm. "
-        "The return is minus the number of steps at which it is not. Brackets: the 95% interval. "
-        "Relative to the oracle, 0% is never successful and 100% is as quick as the script."
+        f"learned from. {meaning} Brackets: the 95% interval.{left_out}"
     )
     rows = [
         [page.escape(name), *(f"{f.value} <small>{f.interval}</small>" for f in figures)]

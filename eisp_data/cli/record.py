@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 from eisp_data.cli.run import run
 from eisp_data.robots.record import RecordConfig
 
@@ -15,7 +17,7 @@ def _command(config: RecordConfig) -> None:
     """Record a session with a robot; ``eisp-data convert`` makes a dataset of the recording."""
     from eisp_data.robots.record import record
 
-    record(config)
+    sys.exit(record(config).exit_status)
 
 
 if __name__ == "__main__":

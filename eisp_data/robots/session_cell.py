@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 _SLACK_M = 0.03
 """Objects may lie this far outside of where the gripper's middle may go."""
+_FIRST_IMAGE_S, _ASK_AGAIN_S = 5.0, 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,10 +73,7 @@ class Cell:
 
         if self.task is None:
             return HandEyes(self.calibration, self.robot.arm)
-        if self.camera is None:
-            raise ConfigError(
-                f"--task {self.task.name}: {self.robot.name} has no camera to see its objects with"
-            )
+        assert self.camera is not None  # or open_cell would have raised
         return TaskEyes(self.task, self.calibration, self.camera, self.robot.arm)
 
     def servo(self) -> CartesianServo:
@@ -116,8 +114,9 @@ def open_cell(config: CellConfig) -> Iterator[Cell]:
     """Connect a robot behind the safety filter; disconnect it at the end, whatever happens.
 
     Raises:
-        ConfigError: an unknown name, a missing extra or file, or a calibration of another cell.
-        RobotError: the robot does not answer.
+        ConfigError: an unknown name, a missing extra or file, a calibration of another cell, or
+            no camera or OpenGL to see a task's objects with.
+        RobotError: the robot or its camera does not answer.
     """
     from eisp_data.robots.safe_robot import SafeRobot
     from eisp_data.tasks.registry import get_task
@@ -137,6 +136,12 @@ def open_cell(config: CellConfig) -> Iterator[Cell]:
         robot.calibrate()
         looks = task is not None or config.camera is not None
         camera = choose_camera(config, robot) if looks else None
+        if task is not None and camera is None:
+            raise ConfigError(
+                f"--task {task.name}: {robot.name} has no camera to see its objects with"
+            )
+        if camera is not None:
+            _await_image(robot, camera)
         yield Cell(robot, task, calibration, camera, bare)
 
 
@@ -153,6 +158,21 @@ def _calibration(config: CellConfig, robot: Robot) -> Calibration:
             f"--robot {config.robot}: missing --calibration, a file that eisp-calibrate writes"
         )
     return usual(robot)
+
+
+def _await_image(robot: SafeRobot, camera: str) -> None:
+    """Wait for an image: a camera that cannot give one, a twin's without OpenGL, is told of before
+    anything is written.
+
+    Raises:
+        ConfigError: there is no OpenGL on this machine.
+        RobotError: it does not answer, or gives no image.
+    """
+    until = robot.now_s() + _FIRST_IMAGE_S
+    while camera not in robot.frames():
+        if robot.now_s() > until:
+            raise RobotError(f"camera {camera!r} gives no image")
+        robot.wait_until(robot.now_s() + _ASK_AGAIN_S)
 
 
 def _check_reach(cell: Cell, goal: np.ndarray) -> None:

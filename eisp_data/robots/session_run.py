@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import os
 import select
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -63,6 +64,14 @@ class Report:
     lost_frames: dict[str, int] = field(default_factory=dict)
     refusals: dict[str, int] = field(default_factory=dict)
     """How often the safety filter changed a command, by reason."""
+    stopped_by: signal.Signals | None = None
+    """The signal with which somebody wanted an end to it."""
+
+    @property
+    def exit_status(self) -> int:
+        """What the command exits with: as a shell does after the signal, or the next one would move
+        a robot that somebody has just stopped."""
+        return 0 if self.stopped_by is None else 128 + self.stopped_by
 
     def lines(self) -> list[str]:
         """Return what is to be said at the end; of each episode it was said when it ended."""
@@ -81,6 +90,8 @@ class Report:
         if self.stats is not None:
             written, dropped = sum(self.stats.written.values()), sum(self.stats.dropped.values())
             found.append(f"{self.output}: {written} messages, {dropped} dropped")
+        if self.stopped_by is not None:
+            found.append(f"stopped by {self.stopped_by.name}")
         return found
 
 
@@ -106,7 +117,7 @@ def run_session(
         EispError: something failed; the robot stands, the recording is closed and has its index.
     """
     with contextlib.ExitStack() as stack:
-        stop = stack.enter_context(stop_signals())
+        stop = stack.enter_context(_stoppable(report))
         cell = stack.enter_context(open_cell(config))
         report.simulated = not runs_by_itself(cell.robot)
         # Whatever takes long is done before anything moves.
@@ -138,6 +149,15 @@ def run_session(
             report.timing = session.ticks.timing()
             report.lost_frames = dict(log.lost_frames)
             report.refusals = dict(cell.robot.filter.refusals)
+
+
+@contextlib.contextmanager
+def _stoppable(report: Report) -> Iterator[StopSignal]:
+    with stop_signals() as stop:
+        try:
+            yield stop
+        finally:
+            report.stopped_by = stop.given
 
 
 @contextlib.contextmanager

@@ -55,14 +55,14 @@ class StopSignal:
     """Whether somebody wants the session to end: Ctrl-C, a closed terminal, or ``kill``."""
 
     def __init__(self) -> None:
-        self.given = ""
-        """Name of the signal that came, or empty."""
+        self.given: signal.Signals | None = None
+        """The signal that came."""
 
     def take(self, number: int, _: FrameType | None) -> None:
         """Note the signal; a second one breaks off whatever hangs."""
         if self.given:
             raise KeyboardInterrupt
-        self.given = signal.Signals(number).name
+        self.given = signal.Signals(number)
 
 
 @contextlib.contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from collections import Counter
 from typing import Any, Self
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from eisp_data.errors import ConfigError
 from eisp_data.sim.scene import BLOCK_SIZE_M
+from eisp_data.storage.files import one_line
 from eisp_data.tasks.base import Task
 
 _GOAL_RADIUS_M = 0.013
@@ -44,8 +46,11 @@ class Renderer:
         self._model, self._data = model, mujoco.MjData(model)
         self._colours = object_colours(task)
         self._gl = open_gl(width, height)
-        self._gl.make_current()
-        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        try:
+            self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        except mujoco.FatalError as error:  # an OpenGL that is too old
+            self._gl.free()
+            raise _cannot_render(error) from error
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + _MARKERS)
         self._camera = mujoco.MjvCamera()
@@ -135,19 +140,40 @@ def object_colours(task: Task) -> list[np.ndarray]:
 
 
 def open_gl(width: int, height: int) -> Any:
-    """Return an OpenGL context: EGL on Linux, unless MUJOCO_GL says otherwise."""
-    if sys.platform == "linux":
-        os.environ.setdefault("MUJOCO_GL", "egl")
+    """Return an OpenGL context, made current: EGL on Linux, unless MUJOCO_GL says otherwise."""
+    if sys.platform == "linux" and not os.environ.get("MUJOCO_GL"):
+        os.environ["MUJOCO_GL"] = "egl"
     try:
-        if os.environ.get("MUJOCO_GL", "").lower() == "egl":
-            # Not by way of mujoco.GLContext: that was chosen when mujoco was first imported.
-            from mujoco.egl import GLContext
-        else:
-            from mujoco import GLContext
-        return GLContext(width, height)
+        # GLFW says in warnings only that there is no display.
+        with warnings.catch_warnings(record=True, action="always") as said:
+            kind = _kind_of_context()
+            context = kind.__new__(kind)
+            context._context = None  # its __del__ wants it, also where __init__ fails
+            context.__init__(width, height)
+            if not context._context:
+                raise RuntimeError(said[0].message if said else "no window")
+            context.make_current()
+        return context
     except Exception as error:
-        raise ConfigError(
-            f"cannot render: OpenGL by MUJOCO_GL={os.environ.get('MUJOCO_GL', '')!r} does not work "
-            f"here ({type(error).__name__}: {error}); install libegl1, or set MUJOCO_GL to one of "
-            "egl, osmesa, glfw"
-        ) from error
+        raise _cannot_render(error) from error
+
+
+def _kind_of_context() -> Any:
+    """Return mujoco's class of OpenGL contexts that MUJOCO_GL names."""
+    backend = os.environ.get("MUJOCO_GL", "").lower().strip()
+    # Not by way of mujoco.GLContext: that was chosen when mujoco was first imported.
+    if backend == "egl":
+        from mujoco.egl import GLContext
+    elif backend == "osmesa":
+        from mujoco.osmesa import GLContext
+    else:
+        from mujoco import GLContext
+    return GLContext
+
+
+def _cannot_render(error: Exception) -> ConfigError:
+    return ConfigError(
+        f"cannot render: OpenGL by MUJOCO_GL={os.environ.get('MUJOCO_GL', '')!r} does not work "
+        f"here ({type(error).__name__}: {one_line(error)}); install libegl1, or set MUJOCO_GL to "
+        "one of egl, osmesa, glfw"
+    )

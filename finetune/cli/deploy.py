@@ -34,7 +34,7 @@ def _command(config: DeployConfig) -> None:
     """Run a policy on a robot, or on its twin; record it, and draw what happened."""
     from finetune.deploy import deploy
 
-    deploy(config)
+    sys.exit(deploy(config).exit_status)
 
 
 if __name__ == "__main__":

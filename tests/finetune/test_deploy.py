@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +27,7 @@ from eisp_data.storage.mcap.reader import McapLog
 from eisp_data.storage.mcap.writer import McapWriter
 from eisp_data.tasks.base import ACTION_SCALE_M
 from eisp_data.tasks.registry import TASKS
+from finetune.cli.deploy import main
 from finetune.config import PolicyConfig
 from finetune.deploy import RESULTS, SETTINGS, deploy
 from finetune.deploy_config import DeployConfig
@@ -313,6 +316,7 @@ def config_for(tmp_path: Path, policy: Path | None, **options: object) -> Deploy
         ({"robot": "ur4"}, "unknown robot 'ur4'; choose one of twin, ur3, tiago"),
         ({"robot": "ur3"}, "missing --host"),
         ({"calibration": Path("nowhere.yaml")}, "nowhere.yaml"),
+        ({"seed": 1_000_000}, "episodes from 1000000 on are learned from"),
         ({"episodes": 0}, "--episodes must be at least 1"),
         ({"subgoals": SubgoalConfig(source="oracle")}, "source oracle needs a simulator"),
     ],
@@ -345,6 +349,41 @@ def test_a_policy_on_the_twin_is_recorded_judged_and_goes_on_where_it_stopped(
         assert log.indexed and not log.problems
         assert log.stats()["/action"].count == 15
         assert {"/subgoal", "/camera/top/image", "/joint_command"} <= set(log.topics)
+
+
+def test_a_deployment_that_could_not_begin_leaves_nothing_in_the_way_of_another(
+    tmp_path: Path, pretrained: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("pinocchio")
+
+    def no_opengl(width: int, height: int) -> None:
+        raise ConfigError("cannot render")
+
+    monkeypatch.setattr("eisp_data.robots.twin.camera.open_gl", no_opengl)
+    for realtime in (False, True):
+        with pytest.raises(ConfigError, match="cannot render"):
+            deploy(config_for(tmp_path, pretrained, realtime=realtime))
+        assert not (tmp_path / "out").exists()
+
+
+def test_a_command_that_comes_after_a_stopped_one_is_not_begun(
+    tmp_path: Path, pretrained: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("pinocchio")
+    skip_without_opengl()
+
+    def press_ctrl_c(run: object, step: int, seen: Seen, decision: Decision) -> None:
+        if step == 3:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr("finetune.deploy._Run.watch", press_ctrl_c)
+    words = ["--task", "stack", "--no-realtime", "--no-record-images", "--episodes", "2"]
+    paths = ["--policy.path", str(pretrained), "--output-dir", str(tmp_path / "out")]
+    monkeypatch.setattr("sys.argv", ["eisp-deploy", *words, *paths])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 128 + signal.SIGINT
+    assert {path.suffix for path in (tmp_path / "out").iterdir()} == {".yaml", ".mcap", ".svg"}
 
 
 def begun(tmp_path: Path, policy: Path | None, results: str, **options: object) -> DeployConfig:

@@ -7,6 +7,7 @@ import sys
 from dataclasses import replace
 
 import pytest
+from image_samples import skip_without_opengl
 
 from eisp_data.config import load_yaml, save_yaml
 from eisp_data.errors import ConfigError
@@ -76,6 +77,20 @@ def test_the_figures_are_not_lost_where_there_is_no_opengl(
     assert json.loads(said.out)["episodes"] == 1
     assert said.err == "no film: cannot render\n"
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_figures_are_not_lost_where_the_disk_is_full(
+    pretrained, small_disk, monkeypatch, capsys
+):
+    skip_without_opengl()
+    film = small_disk("4k") / "film.mp4"
+    words = ["--policy.path", pretrained, "--episodes", "1", "--device", "cpu", "--json"]
+    run(monkeypatch, evaluate, *words, "--video", film)
+    said = capsys.readouterr()
+    assert json.loads(said.out)["episodes"] == 1
+    assert said.err.startswith("no film: ") and "No space left on device" in said.err
+    assert said.err.count("\n") == 1
+    assert list(film.parent.iterdir()) == []
 
 
 def test_without_a_policy_it_learns_fast_and_explores(tmp_path, monkeypatch):

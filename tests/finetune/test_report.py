@@ -107,6 +107,21 @@ def test_the_table_has_the_figures_with_their_intervals(run_dir):
     assert f"{(300 - 89.29) / (300 - 55.4):.0%}" in text
 
 
+def test_of_another_environment_it_says_nothing_that_holds_of_ours_alone(run_dir):
+    text = " ".join("".join(page_of(run_dir).words).split())
+    assert "Eq. (1)" in text and "pretrained offline on recorded episodes, then fine-tuned" in text
+    for name in ("evaluation_before.json", "evaluation_after.json"):
+        foreign = evaluation(0.5, -20.0) | {"task": "FetchReach-v4"}
+        foreign |= dict.fromkeys(("oracle_return", "paper_return", "relative_return"))
+        (run_dir / name).write_text(json.dumps(foreign))
+    lines = (run_dir / "metrics.jsonl").read_text().splitlines(keepends=True)
+    online = [line for line in lines if '"finetune"' in line]
+    (run_dir / "metrics.jsonl").write_text("".join(online))
+    text = " ".join("".join(page_of(run_dir).words).split())
+    assert "Eq. (1)" not in text and "the environment's own" in text
+    assert "It was trained online in simulation." in text
+
+
 def test_the_dip_and_the_recovery_are_told(run_dir):
     text = "".join(page_of(run_dir).words)
     assert "Going online first cost 10 points of the 50% at the start" in text
@@ -162,6 +177,19 @@ def test_a_folder_without_a_run_is_refused(tmp_path):
 def test_a_damaged_evaluation_is_named(run_dir):
     (run_dir / "evaluation_after.json").write_text("{")
     with pytest.raises(DataError, match=r"evaluation_after\.json"):
+        write_report(run_dir)
+
+
+def test_an_evaluation_that_has_not_finished_is_left_out_with_a_word(run_dir, tmp_path):
+    (run_dir / "evaluation_after.json").write_text("")
+    text = "".join(page_of(run_dir).words)
+    assert "evaluation_after.json is empty: its eisp-eval has not finished" in text
+    assert "50% [41%, 59%]" in text
+    (run_dir / "evaluation_before.json").write_text("\n")
+    text = "".join(page_of(run_dir).words)
+    assert "There is no evaluation in this run. evaluation_before.json is empty" in text
+    (run_dir / "metrics.jsonl").unlink()
+    with pytest.raises(ConfigError, match=r"evaluation_after\.json are missing or empty"):
         write_report(run_dir)
 
 

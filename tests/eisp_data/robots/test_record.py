@@ -16,6 +16,7 @@ from bench_robot import BenchRobot
 from hand_on_device import STAY, HandOnGamepad, HandOnKeyboard
 from image_samples import skip_without_opengl
 
+from eisp_data.cli.record import main
 from eisp_data.errors import ConfigError, EispError, RobotError
 from eisp_data.robots import registry, teleop
 from eisp_data.robots.estimates import Estimates, ObjectEstimate
@@ -278,22 +279,84 @@ def test_a_camera_that_is_unplugged_leaves_a_standing_robot_and_a_closed_log(
     assert "26 ticks at 25 Hz" in capsys.readouterr().out
 
 
+class HandThatSignals(HandOnGamepad):
+    """Presses Ctrl-C, or sends another signal, in its tenth tick."""
+
+    def __init__(self, number: signal.Signals, reads: int = 100) -> None:
+        super().__init__(reads)
+        self._number, self._read = number, 0
+
+    def get_action(self) -> dict[str, float]:
+        self._read += 1
+        if self._read == 10:
+            os.kill(os.getpid(), self._number)
+        return super().get_action()
+
+
 def test_ctrl_c_ends_between_two_ticks_with_a_standing_robot_and_a_closed_log(
     tmp_path: Path, bench: type[BenchRobot], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class HandThatPressesCtrlC(HandOnGamepad):
-        def get_action(self) -> dict[str, float]:
-            if len(bench.made[0].sent) == 9:
-                os.kill(os.getpid(), signal.SIGINT)
-            return super().get_action()
-
-    hand_on(monkeypatch, HandThatPressesCtrlC(reads=100))
+    hand_on(monkeypatch, HandThatSignals(signal.SIGINT))
     before = signal.getsignal(signal.SIGINT)
     report = record(recorded(tmp_path, episodes=3))
     assert [ended.outcome for ended in report.episodes] == [""]
     assert bench.made[0].standing and not bench.made[0].connected
     assert end_of(tmp_path / "a.mcap") == (True, [""], 10)
     assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.parametrize(
+    ("hand", "status", "said"),
+    [
+        (HandOnGamepad(reads=5), 0, ""),
+        (HandThatSignals(signal.SIGINT), 130, "stopped by SIGINT\n"),
+        (HandThatSignals(signal.SIGTERM), 143, "stopped by SIGTERM\n"),
+        # With the read that ends the first episode as a success: the second is not begun.
+        (HandThatSignals(signal.SIGINT, reads=9), 130, "stopped by SIGINT\n"),
+    ],
+)
+def test_a_command_that_comes_after_a_stopped_one_is_not_begun(
+    tmp_path: Path,
+    bench: type[BenchRobot],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    hand: HandOnGamepad,
+    status: int,
+    said: str,
+) -> None:
+    hand_on(monkeypatch, hand)
+    words = "--robot bench --host none --control gamepad --episodes 2 --pause-s 0 --output"
+    monkeypatch.setattr("sys.argv", ["eisp-record", *words.split(), str(tmp_path / "a.mcap")])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == status
+    assert capsys.readouterr().out.endswith(f"0 dropped\n{said}")
+    assert bench.made[0].standing
+
+
+@pytest.mark.parametrize(
+    ("cameras", "said"),
+    [
+        ({}, "--task stack: bench has no camera"),
+        ({"top": None}, "camera 'top' gives no image"),
+    ],
+)
+def test_a_camera_that_gives_nothing_is_told_before_anything_is_written(
+    tmp_path: Path,
+    bench: type[BenchRobot],
+    monkeypatch: pytest.MonkeyPatch,
+    cameras: dict[str, None],
+    said: str,
+) -> None:
+    def connect(self: BenchRobot) -> None:
+        self.cameras = cameras
+
+    hand_on(monkeypatch, HandOnGamepad(reads=5))
+    monkeypatch.setattr(BenchRobot, "connect", connect)
+    monkeypatch.setattr(BenchRobot, "frames", lambda self: {})
+    with pytest.raises(EispError, match=said):
+        record(recorded(tmp_path, task="stack"))
+    assert bench.made[0].standing and list(tmp_path.iterdir()) == []
 
 
 def test_only_an_enter_after_the_words_starts_the_next_episode(
