@@ -17,9 +17,10 @@ from typing import Any, Literal
 
 from eisp_data.errors import ConfigError, DataError
 from eisp_data.hub_trust import refuse_path, refuse_pickle, verify
+from eisp_data.storage.cache import fingerprint
 from eisp_data.storage.card import CARD, CITATION, PREVIEW, dataset_card, policy_card
 from eisp_data.storage.checks import Check
-from eisp_data.storage.files import make_partial, one_line
+from eisp_data.storage.files import make_partial, no_writer, one_line
 from eisp_data.storage.mcap.check import checks as recording_checks
 from eisp_data.storage.mcap.summary import recordings
 from eisp_data.storage.schema import CODEBASE_VERSION
@@ -55,6 +56,9 @@ class Plan:
     kind: Kind
     items: list[Item] = field(default_factory=list)
     tag: str = ""
+    root: Path | None = None
+    """Of a dataset: its folder, and what its data were when they were checked."""
+    fingerprint: str = ""
 
     def lines(self) -> list[str]:
         """Return the plan as lines of text."""
@@ -88,7 +92,8 @@ def plan_push(
     repository of their own, whose name ends in ``-raw``.
 
     Raises:
-        DataError: a check fails (its name and detail), or a policy holds a pickled file.
+        DataError: a check fails (its name and detail), a writer has the dataset open, or a policy
+            holds a pickled file.
         ConfigError: ``repo_id`` is not ``owner/name``.
     """
     if not re.fullmatch(r"[\w.-]+/[\w.-]+", repo_id) or ".." in repo_id:
@@ -107,6 +112,12 @@ def plan_push(
         if CARD not in [item.path for item in items]:
             items.append(Item(CARD, policy_card(path, license_name, citation).encode()))
         return Plan(repo_id, "model", kind, items)
+    with no_writer(path):
+        return _plan_dataset(path, repo_id, license_name, citation)
+
+
+def _plan_dataset(path: Path, repo_id: str, license_name: str, citation: str) -> Plan:
+    key = fingerprint(path)
     _refuse_failed(path, validate(path))
     for folder in DATASET_FOLDERS:
         _refuse_link(path / folder)
@@ -118,7 +129,7 @@ def plan_push(
         own.read_bytes() if own.is_file() else dataset_card(path, license_name, citation).encode()
     )
     items += [Item(CARD, card), Item(PREVIEW, preview_png(path))]
-    return Plan(repo_id, "dataset", kind, items, tag=CODEBASE_VERSION)
+    return Plan(repo_id, "dataset", "dataset", items, CODEBASE_VERSION, path, key)
 
 
 def push(plan: Plan, private: bool = False) -> str:
@@ -129,8 +140,18 @@ def push(plan: Plan, private: bool = False) -> str:
     (``data``, ``meta`` and ``videos`` only) is removed in the same commit.
 
     Raises:
-        DataError: the Hub cannot be reached or refuses.
+        DataError: the Hub cannot be reached or refuses, or a dataset is not as it was planned, or
+            a writer has it open.
     """
+    if plan.root is None:
+        return _send(plan, private)
+    with no_writer(plan.root):
+        if fingerprint(plan.root) != plan.fingerprint:
+            raise DataError(f"{plan.root}: changed after it was checked; run it again")
+        return _send(plan, private)
+
+
+def _send(plan: Plan, private: bool) -> str:
     from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi
 
     api = HfApi()

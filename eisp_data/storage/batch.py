@@ -13,7 +13,13 @@ import pyarrow.parquet as pq
 from eisp_data.episode import Episode
 from eisp_data.errors import DataError
 from eisp_data.storage import sidecar
-from eisp_data.storage.episodes import EpisodeIndex, episode_row, episode_table, position
+from eisp_data.storage.episodes import (
+    EpisodeIndex,
+    check_cameras,
+    episode_row,
+    episode_table,
+    position,
+)
 from eisp_data.storage.files import sync
 from eisp_data.storage.parquet import column_names
 from eisp_data.storage.rows import write_rows
@@ -216,9 +222,13 @@ def _frames(batch: Batch, camera: str) -> Iterator[np.ndarray]:
         yield from episode.images[camera][:-1]
 
 
-def remove_orphans(index: EpisodeIndex, spec: DatasetSpec) -> int:
-    """Delete files that no episode points to and return the number of the next file to write."""
-    highest = -1
+def find_orphans(index: EpisodeIndex, spec: DatasetSpec) -> list[Path]:
+    """Return the files of rows and frames that no episode points to: a killed batch leaves some.
+
+    Raises:
+        DataError: there are more than one batch leaves, all its files having one number.
+    """
+    orphans: list[Path] = []
     for folder, used in (
         ("data", {index.data_path(e) for e in range(len(index))}),
         *(
@@ -226,10 +236,21 @@ def remove_orphans(index: EpisodeIndex, spec: DatasetSpec) -> int:
             for c in spec.cameras
         ),
     ):
-        for path in (index.root / folder).glob("chunk-*/file-*"):
-            if path not in used:
-                path.unlink()
-    for path in index.root.glob("**/chunk-*/file-*"):
+        found = sorted((index.root / folder).glob("chunk-*/file-*"))
+        orphans += [path for path in found if path not in used]
+    if len({(path.parent.name, path.stem) for path in orphans}) > 1:
+        raise DataError(
+            f"{index.root}: meta/episodes has no episode for {len(orphans)} files, "
+            f"{orphans[0].relative_to(index.root)} first, more than an interrupted batch leaves; "
+            "run eisp-data repair first"
+        )
+    return orphans
+
+
+def next_file(root: Path) -> int:
+    """Return the number of the next file to write."""
+    highest = -1
+    for path in root.glob("**/chunk-*/file-*"):
         match = re.fullmatch(r"chunk-(\d+)/file-(\d+)", f"{path.parent.name}/{path.stem}")
         if match:
             highest = max(highest, int(match[1]) * CHUNK_SIZE + int(match[2]))
@@ -238,6 +259,7 @@ def remove_orphans(index: EpisodeIndex, spec: DatasetSpec) -> int:
 
 def check_columns(index: EpisodeIndex, spec: DatasetSpec) -> None:
     """Raise DataError if the dataset's own columns are gone: another tool wrote it anew."""
+    check_cameras(index, spec)
     for path in index.tables:
         if "policy" not in column_names(path):
             raise DataError(

@@ -22,6 +22,8 @@ from eisp_data.storage.spec import DatasetSpec
 from eisp_data.storage.stats import Stats
 
 POINTERS = ("episode_index", "length", "data/chunk_index", "data/file_index", "dataset_from_index")
+LATEST_S = 1e9
+"""No video is as long, and no decoder can seek to what damage makes of some times."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,7 @@ def _collect(
         return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)
 
     def seconds(name: str) -> np.ndarray:
-        parts = [table[name].to_numpy().astype(np.float64) for table in kept]
+        parts = [_seconds(table, name, path) for table, path in zip(kept, tables, strict=True)]
         return np.concatenate(parts) if parts else np.zeros(0)
 
     names = kept[0].column_names if kept else []
@@ -135,6 +137,23 @@ def _integers(table: pa.Table, name: str, path: Path) -> np.ndarray:
         return column.to_numpy().astype(np.int64, casting="same_kind")
     except (KeyError, TypeError, pa.ArrowException):
         raise DataError(f"{path}: column {name} is missing or does not hold integers") from None
+
+
+def _seconds(table: pa.Table, name: str, path: Path) -> np.ndarray:
+    try:
+        values = table[name].to_numpy().astype(np.float64, casting="same_kind")
+    except (KeyError, TypeError, pa.ArrowException):
+        raise DataError(f"{path}: column {name} is missing or does not hold numbers") from None
+    if not ((values >= 0) & (values < LATEST_S)).all():  # an empty cell has become NaN
+        raise DataError(f"{path}: column {name} has cells that are empty or no time in a video")
+    return values
+
+
+def check_cameras(index: EpisodeIndex, spec: DatasetSpec) -> None:
+    """Raise DataError unless ``meta/episodes`` says where the frames of every camera are."""
+    for camera in spec.cameras if len(index) else ():
+        if camera not in index.video_file:
+            raise DataError(f"{index.root}/meta/episodes: no video of camera {camera!r}")
 
 
 def read_seeds(root: Path) -> list[int]:

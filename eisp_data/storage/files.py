@@ -10,7 +10,8 @@ import os
 import platform
 import shutil
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,15 @@ def sync(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder and the parents that it needs, each of them safe from a cut cable."""
+    if path.is_dir():
+        return
+    make_folder(path.parent)
+    path.mkdir(exist_ok=True)
+    sync(path.parent)
 
 
 def replace_atomically(path: Path, write: Callable[[Path], object]) -> None:
@@ -169,3 +179,17 @@ class WriterLock:
             _LOCKED_HERE.discard(self._key)
             self._path.unlink(missing_ok=True)
             os.close(self._descriptor)
+
+
+@contextmanager
+def no_writer(folder: Path) -> Iterator[None]:
+    """Keep writers out of a folder meanwhile; DataError if one is at work.
+
+    A folder that cannot be written needs no lock, and could not hold one.
+    """
+    lock = WriterLock(folder) if os.access(folder, os.W_OK) else None
+    try:
+        yield
+    finally:
+        if lock is not None:
+            lock.release()

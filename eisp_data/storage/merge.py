@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from eisp_data.errors import DataError
-from eisp_data.storage.episodes import read_index
+from eisp_data.storage.episodes import check_cameras, read_index
 from eisp_data.storage.reader import read_blocks, read_recipe, read_spec
 from eisp_data.storage.rewrite import Source, rewrite
+from eisp_data.storage.video_checks import check_frame_counts
 
 
 def merge(roots: Sequence[Path], to: Path) -> int:
@@ -37,6 +38,8 @@ def merge(roots: Sequence[Path], to: Path) -> int:
         for _ in read_blocks(root, spec):  # every row is looked at before anything is written
             pass
         index = read_index(root)
+        check_cameras(index, spec)
+        check_frame_counts(index, spec)  # videos are copied unseen, so damage would go along
         sources.append(Source(index, range(len(index))))
         recipe = read_recipe(root)
         for one in recipe["merged"] if list(recipe) == ["merged"] else [recipe]:

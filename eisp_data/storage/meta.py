@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from eisp_data.storage.episodes import EpisodeIndex, episodes_path, read_index
-from eisp_data.storage.files import read_json, replace_atomically
+from eisp_data.storage.files import read_json, replace_atomically, sync
 from eisp_data.storage.parquet import read_parquet
 from eisp_data.storage.schema import (
     CHUNK_SIZE,
@@ -124,6 +124,8 @@ def compact_episodes(root: Path) -> None:
         replace_atomically(
             first, lambda temporary: pq.write_table(table, temporary, write_page_checksum=True)
         )
-    for path in (*index.tables, *index.stale):
-        if path != first:
-            path.unlink(missing_ok=True)
+    repeated = [path for path in (*index.tables, *index.stale) if path != first]
+    if repeated:
+        sync(first.parent)  # a cut cable must not undo the renaming and keep the removals
+    for path in repeated:
+        path.unlink(missing_ok=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from eisp_data.storage.cache import load_arrays
-from eisp_data.storage.episodes import read_index
+from eisp_data.storage.episodes import check_cameras, read_index
 from eisp_data.storage.reader import read_spec
 from eisp_data.storage.video import decode_video
 
@@ -24,6 +24,7 @@ def preview_png(root: Path, episodes: int = 6) -> bytes:
         episodes: how many, evenly spread.
     """
     spec, index = read_spec(root), read_index(root)
+    check_cameras(index, spec)
     chosen = np.unique(np.linspace(0, len(index) - 1, min(episodes, len(index))).astype(int))
     if spec.cameras:
         camera = next(iter(spec.cameras))

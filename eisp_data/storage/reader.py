@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from eisp_data.episode import Episode
 from eisp_data.errors import DataError
-from eisp_data.storage.episodes import EpisodeIndex, read_index
+from eisp_data.storage.episodes import EpisodeIndex, check_cameras, read_index
 from eisp_data.storage.files import read_json
 from eisp_data.storage.meta import SIDECAR_PATH
 from eisp_data.storage.rows import as_table, column_values, read_rows
@@ -43,6 +43,11 @@ def check_version(root: Path) -> dict[str, Any]:
     version = info.get("codebase_version") if isinstance(info, dict) else None
     if not isinstance(version, str) or not version.startswith("v3."):
         raise DataError(f"{root}: dataset format {version!r}; only v3 can be read")
+    if SIDECAR_COLUMN not in (info.get("features") or (SIDECAR_COLUMN,)):
+        raise DataError(
+            f"{root}: a LeRobot dataset that was not made here: it says neither what was achieved "
+            f"nor what should be (no column {SIDECAR_COLUMN}), so nothing can be learned from it"
+        )
     return info
 
 
@@ -179,10 +184,9 @@ def build_episode(
 def _images(
     index: EpisodeIndex, number: int, sidecar: Sidecar, spec: DatasetSpec
 ) -> dict[str, np.ndarray]:
+    check_cameras(index, spec)
     images = {}
     for camera, size in spec.cameras.items():
-        if camera not in index.video_file:
-            raise DataError(f"{index.root}: episode {number}: no video of camera {camera!r}")
         start = round(float(index.video_start_s[camera][number]) * spec.fps)
         stop = start + int(index.length[number])
         frames = decode_video(index.video_path(number, camera), start, stop, spec.fps, size)

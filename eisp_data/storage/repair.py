@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from eisp_data.errors import DataError
-from eisp_data.storage.files import WriterLock, read_json
+from eisp_data.storage.files import no_writer, read_json
 from eisp_data.storage.meta import SIDECAR_PATH
 from eisp_data.storage.pages import recover_rows
 from eisp_data.storage.parquet import group_rows, read_parquet
@@ -84,8 +84,7 @@ def repair(root: Path | str, to: Path | None = None, in_place: bool = False) -> 
     copy, damaged = to or repaired_path(root), root.parent / f"{root.name}.damaged"
     if in_place and damaged.exists():
         raise DataError(f"{damaged}: exists already; move it away first")
-    lock = WriterLock(root) if os.access(root, os.W_OK) else None
-    try:
+    with no_writer(root):
         report = RepairReport(copy, root)
         spec, recipe = _shared(root)
         pointers = _pointers(root)
@@ -98,9 +97,6 @@ def repair(root: Path | str, to: Path | None = None, in_place: bool = False) -> 
                     continue
                 report.episodes += 1
                 report.frames += len(found.columns["index"])
-    finally:
-        if lock is not None:
-            lock.release()
     if in_place:
         os.rename(root, damaged)
         os.rename(copy, root)

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from eisp_data.storage.spec import DatasetSpec
+if TYPE_CHECKING:
+    from eisp_data.storage.spec import DatasetSpec
 
 CODEBASE_VERSION = "v3.0"
 SIDECAR_COLUMN = "eisp.episode"
 """String column: JSON in each episode's first row, empty in the others. See ``sidecar.py``."""
 SIM_STATE_COLUMN = "sim.state"
 """Outside ``observation.*``, which LeRobot would offer to a policy as input."""
+AGE = "age_s."
+"""Column with the age of a recording's source; below 0 where the nearest sample came later."""
+INTERVENTION = "intervention"
+"""The column of a recording that is 1 while a human had taken over."""
+IMAGE = "observation.images."
+"""What the feature name of every camera begins with."""
 REPEATED = "repeated."
 """Column of a recording's camera: 1 in rows that show a frame again, for the next one was lost."""
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -22,6 +29,18 @@ CHUNK_SIZE = 1000
 DATA_FILE_MB = 100
 VIDEO_FILE_MB = 200
 
+ROW_FEATURES = {
+    "observation.state": "float32",
+    "observation.environment_state": "float32",
+    "observation.achieved_goal": "float32",
+    "observation.desired_goal": "float32",
+    "action": "float32",
+    "next.reward": "float32",
+    "next.done": "bool",
+    "next.truncated": "bool",
+    "next.success": "bool",
+    SIM_STATE_COLUMN: "float64",
+}
 INDEX_FEATURES = {
     "timestamp": "float32",
     "frame_index": "int64",
@@ -33,7 +52,12 @@ INDEX_FEATURES = {
 
 def video_key(camera: str) -> str:
     """Return the feature name of a camera."""
-    return f"observation.images.{camera}"
+    return f"{IMAGE}{camera}"
+
+
+def is_standard(name: str) -> bool:
+    """Return whether a column has a meaning of its own, so that no extra one can have its name."""
+    return name in {*ROW_FEATURES, *INDEX_FEATURES, SIDECAR_COLUMN} or name.startswith(IMAGE)
 
 
 def column_widths(spec: DatasetSpec) -> dict[str, tuple[str, int]]:
@@ -41,17 +65,16 @@ def column_widths(spec: DatasetSpec) -> dict[str, tuple[str, int]]:
 
     The index columns of LeRobot are included; the sidecar and the videos are not numeric.
     """
+    widths = {
+        "observation.state": spec.proprio_dim,
+        "observation.environment_state": spec.observation_dim - spec.proprio_dim,
+        "observation.achieved_goal": spec.goal_dim,
+        "observation.desired_goal": spec.goal_dim,
+        "action": spec.action_dim,
+        SIM_STATE_COLUMN: spec.sim_state_dim,
+    }
     columns = {
-        "observation.state": ("float32", spec.proprio_dim),
-        "observation.environment_state": ("float32", spec.observation_dim - spec.proprio_dim),
-        "observation.achieved_goal": ("float32", spec.goal_dim),
-        "observation.desired_goal": ("float32", spec.goal_dim),
-        "action": ("float32", spec.action_dim),
-        "next.reward": ("float32", 1),
-        "next.done": ("bool", 1),
-        "next.truncated": ("bool", 1),
-        "next.success": ("bool", 1),
-        SIM_STATE_COLUMN: ("float64", spec.sim_state_dim),
+        **{name: (dtype, widths.get(name, 1)) for name, dtype in ROW_FEATURES.items()},
         **{name: ("float32", width) for name, width in spec.extras.items()},
         **{name: (dtype, 1) for name, dtype in INDEX_FEATURES.items()},
     }

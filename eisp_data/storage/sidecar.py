@@ -15,6 +15,7 @@ import binascii
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,8 @@ from eisp_data.storage.spec import DatasetSpec
 from eisp_data.storage.video import decode_jpeg, encode_jpeg
 
 FORMAT = 1
+_SHARED = '"spec": {'
+"""How ``dataset_part`` begins; what ``encode`` puts before it cannot hold this after a comma."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +103,7 @@ def encode(episode: Episode, shared: str) -> str:
 def decode(text: str, where: str) -> Sidecar:
     """Return the sidecar of a string; DataError, beginning with ``where``, if it is broken."""
     try:
-        value = json.loads(text)
+        value = _parse(text)
         if value["eisp"] != FORMAT:
             raise DataError(
                 f"{where}: sidecar format {value['eisp']!r}; this version reads {FORMAT}"
@@ -130,6 +133,22 @@ def decode(text: str, where: str) -> Sidecar:
             f"the dataset's cameras are {sorted(spec.cameras)}"
         )
     return sidecar
+
+
+def _parse(text: str) -> dict[str, Any]:
+    """Return the JSON of a sidecar, with one object for the equal dataset parts of several."""
+    own, comma, shared = text.partition(f", {_SHARED}")
+    if not comma:
+        value: dict[str, Any] = json.loads(text)
+        return value
+    return {**json.loads(own + "}"), **_parse_shared(f"{{{_SHARED}{shared}")}
+
+
+@lru_cache(maxsize=4)
+def _parse_shared(text: str) -> dict[str, Any]:
+    """Return the JSON of a dataset part, which names every file that a dataset was made of."""
+    value: dict[str, Any] = json.loads(text)
+    return value
 
 
 def _to_text(raw: bytes) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 
 from eisp_data.episode import Episode
 from eisp_data.errors import DataError
+from eisp_data.storage.schema import is_standard
 
 
 def _empty() -> Mapping[str, Any]:
@@ -69,6 +70,11 @@ class DatasetSpec:
         for name in (*self.cameras, *self.extras):
             if "/" in name or not name:
                 raise DataError(f"spec: {name!r} cannot name a column: it must not hold a slash")
+        for name in self.extras:
+            if is_standard(name):  # it would silently take the place of the column itself
+                raise DataError(
+                    f"spec: {name!r} cannot name an extra column: every dataset has its own"
+                )
 
     def check(self, episode: Episode) -> None:
         """Raise DataError, naming array and sizes, unless ``episode`` has this spec's shapes."""

@@ -16,7 +16,14 @@ from eisp_data.episode import Episode
 from eisp_data.errors import DataError
 from eisp_data.storage import batch as batches
 from eisp_data.storage.episodes import read_index
-from eisp_data.storage.files import WriterLock, read_json, remove_temporaries, sync, write_json
+from eisp_data.storage.files import (
+    WriterLock,
+    make_folder,
+    read_json,
+    remove_temporaries,
+    sync,
+    write_json,
+)
 from eisp_data.storage.meta import (
     SIDECAR_PATH,
     compact_episodes,
@@ -54,8 +61,8 @@ class DatasetWriter:
                 must have the same spec and recipe.
 
         Raises:
-            DataError: a dataset is there and ``resume`` is not set, spec or recipe differ, or
-                another writer has it open.
+            DataError: a dataset is there and ``resume`` is not set, spec or recipe differ, more
+                of it is missing than a kill takes, or another writer has it open.
         """
         self.root = Path(root)
         self.spec = spec
@@ -77,7 +84,7 @@ class DatasetWriter:
             )
         ):
             raise DataError(f"{self.root}: not empty, and not a dataset; choose another folder")
-        self.root.mkdir(parents=True, exist_ok=True)
+        make_folder(self.root)
         self._lock = WriterLock(self.root)
         try:
             self._closed = False
@@ -145,21 +152,31 @@ class DatasetWriter:
 
     def _start(self) -> None:
         shutil.rmtree(self.root / STAGING, ignore_errors=True)
-        write_json(self.root / SIDECAR_PATH, sidecar_json(self.spec, self.recipe))
+        sidecar = self.root / SIDECAR_PATH
+        make_folder(sidecar.parent)
+        write_json(sidecar, sidecar_json(self.spec, self.recipe))
+        sync(sidecar.parent)
         write_tasks(self.root, self.spec.instruction)
         write_json(self.root / "meta/info.json", info_json(self.spec, 0, 0))
 
     def _recover(self) -> None:
-        """Drop what an interrupted batch left, and bring the summaries up to the episodes."""
+        """Drop what an interrupted batch left, and bring the summaries up to the episodes.
+
+        Nothing is removed unless all that is there can be what an interrupted batch left.
+        """
         self._check_same()
-        shutil.rmtree(self.root / STAGING, ignore_errors=True)
         index = read_index(self.root)
-        for path in index.stale:
-            path.unlink()
-        self._next_file = batches.remove_orphans(index, self.spec)
-        self.num_episodes, self.num_frames = len(index), int(index.length.sum())
-        batches.check_columns(index, self.spec)
         info = read_json(self.root / "meta/info.json")
+        self._check_stated(info.get("total_episodes"), len(index))
+        batches.check_columns(index, self.spec)
+        orphans = batches.find_orphans(index, self.spec)
+        shutil.rmtree(self.root / STAGING, ignore_errors=True)
+        if index.stale:
+            sync(index.tables[0].parent)  # as in compact_episodes, which was interrupted
+        for path in (*index.stale, *orphans):
+            path.unlink()
+        self._next_file = batches.next_file(self.root)
+        self.num_episodes, self.num_frames = len(index), int(index.length.sum())
         self._stats = summed_stats(self.root, index)
         if (info.get("total_episodes"), info.get("total_frames")) != (
             self.num_episodes,
@@ -169,6 +186,14 @@ class DatasetWriter:
                 write_json(self.root / "meta/stats.json", stats_json(self._stats))
             summary = info_json(self.spec, self.num_episodes, self.num_frames)
             write_json(self.root / "meta/info.json", summary)
+
+    def _check_stated(self, stated: object, found: int) -> None:
+        """Raise DataError if ``info.json``, always written last, knows of more episodes."""
+        if not isinstance(stated, int) or stated > found:
+            raise DataError(
+                f"{self.root}: info.json says {stated} episodes, meta/episodes has {found}; "
+                "run eisp-data repair first"
+            )
 
     def _check_same(self) -> None:
         spec, recipe = read_spec(self.root), read_recipe(self.root)
@@ -207,14 +232,26 @@ class DatasetWriter:
         ):
             write_json(staging / name, value)
             staged.append((staging / name, Path("meta") / name))
-        for source, target in staged:
-            final = self.root / target
-            final.parent.mkdir(parents=True, exist_ok=True)
-            os.replace(source, final)
-        for folder in {(self.root / target).parent for _, target in staged}:
-            sync(folder)
+        self._put_in_place(staged)
         self._stats, self.num_episodes, self.num_frames = totals, episodes, frames
         self._next_file += 1
+
+    def _put_in_place(self, staged: Sequence[tuple[Path, Path]]) -> None:
+        """Rename files into place, in order, also on the disk.
+
+        Each file of ``meta`` counts on those before it, so a cut cable may not keep it alone.
+        """
+        renamed: set[Path] = set()
+        for source, target in staged:
+            final = self.root / target
+            make_folder(final.parent)
+            if target.parts[0] == "meta":
+                while renamed:
+                    sync(renamed.pop())
+            os.replace(source, final)
+            renamed.add(final.parent)
+        while renamed:
+            sync(renamed.pop())
 
     def _remove_empty(self) -> None:
         """Leave nothing of a dataset that never got an episode."""

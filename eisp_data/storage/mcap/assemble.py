@@ -12,10 +12,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from eisp_data.episode import Episode, Scalar
+from eisp_data.errors import DataError
 from eisp_data.storage.mcap import timeline
 from eisp_data.storage.mcap.build import GOAL, build_episode, scale_action
 from eisp_data.storage.mcap.collect import Clock, Source
-from eisp_data.storage.mcap.columns import INTERVENTION, age_columns
+from eisp_data.storage.mcap.columns import age_columns
 from eisp_data.storage.mcap.mapping import EXTRA
 from eisp_data.storage.mcap.reader import McapLog
 from eisp_data.storage.mcap.resample import (
@@ -28,8 +29,8 @@ from eisp_data.storage.mcap.resample import (
     usual_gap_ns,
 )
 from eisp_data.storage.mcap.sources import Recording, fetch_images
-from eisp_data.storage.mcap.windows import Window, dropped
-from eisp_data.storage.schema import REPEATED
+from eisp_data.storage.mcap.windows import Window, dropped, started, unknown_words
+from eisp_data.storage.schema import INTERVENTION, REPEATED
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,8 @@ class Assembler:
     """Makes the episodes of one file."""
 
     def __init__(self, log: McapLog, recording: Recording, rate: Rate, task: str) -> None:
-        """Raise DataError if the clocks of the sources cannot be the same."""
+        """Raise DataError if the clocks of the sources cannot be the same, or if none of the events
+        is understood: all would be one episode, with what lay between them."""
         timeline.check_clocks(recording, rate.clock)
         self.log, self.recording, self.rate, self.task = log, recording, rate, task
         self._file = recording.path.name
@@ -71,6 +73,10 @@ class Assembler:
             f"{self._file}: {topic}: {n} messages dropped while recording"
             for topic, n in dropped(recording.events).items()
         ]
+        if unknown := unknown_words(recording.events):
+            if not started(recording.events):
+                raise DataError(f"{recording.path}: {unknown}")
+            self.lines.append(f"{self._file}: {unknown}")
         self.lines += [
             f"{self._file}: {source.stream.topic}: {n} samples {reason} left out"
             for source in recording.sources
@@ -85,6 +91,8 @@ class Assembler:
             if window.outcome == "discard":
                 self._say(window, "discarded by the operator")
                 continue
+            if rest := timeline.rest_left_out(self.recording, window):
+                self._say(window, rest)
             rows = timeline.Timeline(self.recording, window, period_ns)
             stretches, left_out = rows.stretches()
             if left_out:

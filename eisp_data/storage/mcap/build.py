@@ -61,7 +61,8 @@ def build_episode(
     goal = columns[GOAL][0].astype(np.float32) if GOAL in columns else achieved[-1].copy()
     if goal.shape != achieved.shape[1:]:
         raise DataError(
-            f"the achieved goal has {achieved.shape[1]} components, the desired goal {len(goal)}"
+            f"the achieved goal has {achieved.shape[1]} components, the desired goal {len(goal)}: "
+            f"in the mapping, the streams to {REACHED} must be of what those to {GOAL} are of"
         )
     steps = len(state) - 1
     met = np.linalg.norm(achieved - goal, axis=1) <= epsilon_m

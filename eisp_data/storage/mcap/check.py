@@ -15,7 +15,7 @@ from eisp_data.storage.mcap import decode, pixels
 from eisp_data.storage.mcap.reader import Entry, McapLog
 from eisp_data.storage.mcap.resample import longest_usual_gap_ns
 from eisp_data.storage.mcap.tally import Tally
-from eisp_data.storage.mcap.windows import cut
+from eisp_data.storage.mcap.windows import cut, started, unknown_words
 
 STUCK_MESSAGES = 50
 """A sensor that has sent the very same reading this often, and never another, is stuck."""
@@ -186,12 +186,13 @@ def _images(seen: dict[str, _Seen]) -> Check:
 
 
 def _episodes(events: list[decode.Event], seen: dict[str, _Seen]) -> Check:
-    started = sum(event.kind == "episode_start" for event in events)
-    if not started:
-        return Check("episodes", True, "no events: the whole recording is one")
+    begun, unknown = started(events), unknown_words(events)
+    if not begun:
+        return Check("episodes", not unknown, unknown or "no events: the whole recording is one")
     last = max(s.times[-1] for s in seen.values() if s.times)
     windows = cut(sorted(events, key=lambda event: event.time_ns or 0), 0, int(last * 1e9))
     complete = sum(window.complete for window in windows)
     success = sum(window.outcome == "success" for window in windows)
-    detail = f"{started} started, {complete} ended, {success} a success"
-    return Check("episodes", complete == started, detail)
+    detail = f"{begun} started, {complete} ended, {success} a success"
+    detail += f"; {unknown}" if unknown else ""
+    return Check("episodes", complete == begun, detail, bool(unknown))

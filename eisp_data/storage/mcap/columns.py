@@ -5,12 +5,7 @@ from __future__ import annotations
 from eisp_data.storage.mcap.collect import Source
 from eisp_data.storage.mcap.mapping import EXTRA
 from eisp_data.storage.mcap.sources import Recording
-from eisp_data.storage.schema import REPEATED
-
-AGE = "age_s."
-"""Columns with the age of each source; below 0 where the nearest sample came later."""
-INTERVENTION = "intervention"
-"""The column that is 1 while a human had taken over."""
+from eisp_data.storage.schema import AGE, INTERVENTION, REPEATED
 
 
 def age_columns(sources: list[Source]) -> list[str]:

@@ -15,11 +15,12 @@ from eisp_data.storage.mcap.assemble import ORIGIN, Assembler, Made, Origin, Rat
 from eisp_data.storage.mcap.build import GOAL, REACHED, STATE, WORLD
 from eisp_data.storage.mcap.collect import Clock
 from eisp_data.storage.mcap.columns import age_columns, extra_widths
-from eisp_data.storage.mcap.guess import guess_mapping
+from eisp_data.storage.mcap.guess import guess_mapping, suggestion
 from eisp_data.storage.mcap.mapping import Mapping, load_mapping
 from eisp_data.storage.mcap.reader import McapLog
 from eisp_data.storage.mcap.repair import repaired_path
 from eisp_data.storage.mcap.sources import Recording, load
+from eisp_data.storage.mcap.summary import refuse_sqlite
 from eisp_data.storage.reader import read_sidecars
 
 _BATCH_BYTES = 64 * 2**20
@@ -88,6 +89,7 @@ def find_inputs(inputs: tuple[Path, ...]) -> tuple[list[Path], list[str]]:
         if path.is_dir():
             inside = sorted(path.rglob("*.mcap"))
             if not inside:
+                refuse_sqlite(path)
                 raise DataError(f"{path}: no .mcap file in this folder")
         elif path.exists():
             inside = [path]
@@ -145,8 +147,9 @@ def convert(
 
 
 def suggested_mapping(config: ConvertConfig) -> str:
-    """Return the text of the mapping file that ``convert`` would use, to be edited by hand."""
-    return _mapping(config, find_inputs(config.inputs)[0][0]).to_yaml()
+    """Return the text of a mapping file for the first recording, to be edited by hand."""
+    with McapLog(find_inputs(config.inputs)[0][0]) as log:
+        return suggestion(log)
 
 
 def _made(

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
+
 from eisp_data.errors import DataError
 from eisp_data.storage.mcap import decode
-from eisp_data.storage.mcap.mapping import Mapping, StreamMap
+from eisp_data.storage.mcap.mapping import NEEDED, Mapping, StreamMap, mapping_yaml
 from eisp_data.storage.mcap.reader import McapLog
 from eisp_data.storage.mcap.sources import STATIC
 from eisp_data.storage.mcap.writer import ROLE_KEY, camera_name
@@ -13,8 +15,9 @@ _LOOKED_AT = 200
 """How many messages of a channel of transforms are read for the names of their frames."""
 _STATE, _WORLD = "observation.state", "observation.environment_state"
 _REACHED, _WANTED = "observation.achieved_goal", "observation.desired_goal"
+_ROBOT = {"gripper", "tool", "tool0", "tcp", "ee", "eef", "effector", "hand", "flange", "wrist"}
 _WORDS = {
-    "action": ("command", "commands", "cmd", "action", "cmd_vel"),
+    "action": ("command", "commands", "cmd", "action", "cmd_vel", "delta_twist_cmds"),
     _WANTED: ("goal", "desired_goal"),
 }
 
@@ -27,6 +30,34 @@ def guess_mapping(log: McapLog) -> Mapping:
     channels of numbers called ``command`` or ``goal`` action and desired goal; images are images.
     Raises DataError, naming what is missing, if that is not enough to make a dataset of.
     """
+    streams, missing = _guess(log)
+    if missing:
+        raise DataError(
+            f"{log.path}: nothing in it tells what {' and '.join(missing)} should be; give a "
+            "mapping file (--show-mapping prints what to begin with). It has the channels "
+            f"{', '.join(sorted(log.topics)) or 'none'}"
+        )
+    return Mapping(streams=streams, **_session(log))
+
+
+def suggestion(log: McapLog) -> str:
+    """Return the text of a mapping file to be edited: what is missing, and the channels that it
+    does not use, are comments in it."""
+    streams, missing = _guess(log)
+    notes = [f"still needed: a stream with to: {role}" for role in missing]
+    for topic in sorted(set(log.topics) - {stream.topic for stream in streams}):
+        schema = log.schema_of(log.topics[topic])
+        notes.append(f"not used: {topic} ({schema.name if schema else 'no schema'})")
+    return mapping_yaml(streams, **_session(log)) + "".join(f"# {note}\n" for note in notes)
+
+
+def _session(log: McapLog) -> dict[str, str]:
+    said = log.metadata().get("session", {})
+    return {"task": said.get("task", ""), "instruction": said.get("instruction", "")}
+
+
+def _guess(log: McapLog) -> tuple[tuple[StreamMap, ...], list[str]]:
+    """Return the streams that a recording suggests, and the roles that none of them has."""
     claimed = {
         topic: channel.metadata[ROLE_KEY]
         for topic, channel in log.topics.items()
@@ -39,19 +70,17 @@ def guess_mapping(log: McapLog) -> Mapping:
         # One topic for each camera and for the events; raw and compressed are the same images.
         taken |= {s.to for s in found if s.camera or s.to == "events"}
         streams += found
+    # Where the robot is itself is a goal only if it is all there is to reach.
+    reached = [s for s in streams if s.to == _REACHED and s.topic not in claimed]
+    of_robot = [stream for stream in reached if _is_of_robot(stream)]
+    if len(of_robot) < len(reached):
+        streams = [stream for stream in streams if stream not in of_robot]
     roles = {stream.to for stream in streams}
-    missing = [role for role in (_STATE, _REACHED, "action") if role not in roles]
-    if missing:
-        raise DataError(
-            f"{log.path}: nothing in it tells what {' and '.join(missing)} should be; give a "
-            f"mapping file. It has the channels {', '.join(sorted(log.topics)) or 'none'}"
-        )
-    session = log.metadata().get("session", {})
-    return Mapping(
-        streams=tuple(streams),
-        task=session.get("task", ""),
-        instruction=session.get("instruction", ""),
-    )
+    return tuple(streams), [role for role in NEEDED if role not in roles]
+
+
+def _is_of_robot(stream: StreamMap) -> bool:
+    return not _ROBOT.isdisjoint(re.split(r"[/_]", f"{stream.topic}/{stream.frame}".lower()))
 
 
 def _by_type(log: McapLog, topic: str) -> list[StreamMap]:

@@ -18,6 +18,7 @@ Recordings of this toolkit say it themselves, in the metadata of their channels.
 from __future__ import annotations
 
 from collections.abc import Mapping as Dict
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from typing import Any
 import yaml
 
 from eisp_data.errors import ConfigError
+from eisp_data.storage.schema import AGE, IMAGE, INTERVENTION, REPEATED, is_standard
 
 ROLES = (
     "observation.state",
@@ -44,7 +46,9 @@ FIELDS = {
     "poses": ("position", "orientation"),
     "vector": ("values",),
 }
-IMAGE, EXTRA = "observation.images.", "extra."
+EXTRA = "extra."
+NEEDED = ("observation.state", "observation.achieved_goal", "action")
+"""Roles without which a recording makes no dataset."""
 
 
 def check_role(topic: str, role: str) -> None:
@@ -54,6 +58,13 @@ def check_role(topic: str, role: str) -> None:
         raise ConfigError(
             f"{topic}: to: {role!r}; choose one of {', '.join(ROLES)}, "
             f"{IMAGE}<camera>, {EXTRA}<column>"
+        )
+    column = role.removeprefix(EXTRA)
+    made = column == INTERVENTION or column.startswith((AGE, REPEATED))
+    if role.startswith(EXTRA) and (made or is_standard(column)):
+        raise ConfigError(
+            f"{topic}: to: {role!r}: {column!r} is a column that datasets have of their own; "
+            "choose another name"
         )
 
 
@@ -143,7 +154,7 @@ class Mapping:
 
     def __post_init__(self) -> None:
         roles = [stream.to for stream in self.streams]
-        for needed in ("observation.state", "observation.achieved_goal", "action"):
+        for needed in NEEDED:
             if needed not in roles:
                 raise ConfigError(
                     f"mapping: no stream has to: {needed}; it has {', '.join(sorted(set(roles)))}"
@@ -154,20 +165,7 @@ class Mapping:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values that ``from_json`` takes back, defaults left out."""
-        streams = []
-        for stream in self.streams:
-            default = StreamMap(topic=stream.topic, to=stream.to)
-            changed = {
-                key: list(value) if isinstance(value, tuple) else value
-                for key, value in asdict(stream).items()
-                if value != getattr(default, key)
-            }
-            streams.append({"topic": stream.topic, "to": stream.to, **changed})
-        return {"instruction": self.instruction, "task": self.task, "streams": streams}
-
-    def to_yaml(self) -> str:
-        """Return the text of a mapping file."""
-        return yaml.safe_dump(self.to_json(), sort_keys=False, allow_unicode=True)
+        return _plain(self.streams, self.instruction, self.task)
 
     @classmethod
     def from_json(cls, values: Any) -> Mapping:
@@ -178,6 +176,24 @@ class Mapping:
             raise ConfigError("mapping: 'streams' must be a list of at least one stream")
         found = tuple(_stream(stream, i) for i, stream in enumerate(streams))
         return cls(**{**values, "streams": found})
+
+
+def mapping_yaml(streams: Sequence[StreamMap], instruction: str, task: str) -> str:
+    """Return the text of a mapping file, which need not be a whole mapping yet."""
+    return yaml.safe_dump(_plain(streams, instruction, task), sort_keys=False, allow_unicode=True)
+
+
+def _plain(streams: Sequence[StreamMap], instruction: str, task: str) -> dict[str, Any]:
+    plain = []
+    for stream in streams:
+        default = StreamMap(topic=stream.topic, to=stream.to)
+        changed = {
+            key: list(value) if isinstance(value, tuple) else value
+            for key, value in asdict(stream).items()
+            if value != getattr(default, key)
+        }
+        plain.append({"topic": stream.topic, "to": stream.to, **changed})
+    return {"instruction": instruction, "task": task, "streams": plain}
 
 
 def load_mapping(path: str | Path) -> Mapping:

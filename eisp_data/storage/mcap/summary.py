@@ -16,11 +16,22 @@ from eisp_data.storage.mcap.writer import ROLE_KEY
 def recordings(path: Path) -> list[Path]:
     """Return the MCAP files that ``path`` names: itself, or those in a folder (a ROS 2 bag).
 
-    Raises DataError if there is no such file or folder; in a folder there may be none.
+    Raises DataError if there is no such file or folder, or if it is a bag of another kind; in a
+    folder there may be none.
     """
     if not path.exists():
         raise DataError(f"{path}: no such file or folder")
+    refuse_sqlite(path)
     return sorted(path.glob("*.mcap")) if path.is_dir() else [path]
+
+
+def refuse_sqlite(path: Path) -> None:
+    """Raise DataError for a ROS 2 bag that is not MCAP, the default until Iron."""
+    if path.suffix == ".db3" or (path.is_dir() and any(path.glob("*.db3"))):
+        raise DataError(
+            f"{path}: a ROS 2 bag in sqlite3; ros2 bag convert makes an MCAP of it (storage_id: "
+            "mcap), and ros2 bag record -s mcap records one"
+        )
 
 
 def summary(path: Path) -> dict[str, Any]:

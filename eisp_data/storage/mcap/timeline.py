@@ -11,7 +11,7 @@ import numpy as np
 from eisp_data.errors import DataError
 from eisp_data.storage.mcap.build import GOAL, STATE
 from eisp_data.storage.mcap.collect import Clock, Source
-from eisp_data.storage.mcap.resample import NANOSECONDS, pick
+from eisp_data.storage.mcap.resample import NANOSECONDS, longest_usual_gap_ns, pick, usual_gap_ns
 from eisp_data.storage.mcap.sources import Recording
 from eisp_data.storage.mcap.windows import Window, cut
 
@@ -37,13 +37,35 @@ def check_clocks(recording: Recording, clock: Clock) -> None:
 
 def windows(recording: Recording) -> list[Window]:
     """Return where the episodes of a recording begin and end."""
-    # These stop when the recording stops; a goal or a fixed thing's pose may be said once.
+    return cut(recording.events, recording.first_ns, _ends(recording)[0][0])
+
+
+def _ends(recording: Recording) -> list[tuple[int, Source]]:
+    """Return the last times of the sources that stop when the recording stops, first one first.
+
+    The others may be said once, as a goal or the pose of a fixed thing.
+    """
     ends = [
-        int(s.series.times_ns[-1])
-        for s in recording.sources
-        if s.stream.camera or s.stream.to in (STATE, "action")
+        (int(source.series.times_ns[-1]), source)
+        for source in recording.sources
+        if source.stream.camera or source.stream.to in (STATE, "action")
     ]
-    return cut(recording.events, recording.first_ns, min(ends))
+    return sorted(ends, key=lambda end: end[0])
+
+
+def rest_left_out(recording: Recording, window: Window) -> str:
+    """Say which source stopped well before the others if that ended the window, else nothing."""
+    ends = _ends(recording)
+    stop, source = ends[0]
+    after_ns = ends[-1][0] - max(stop, window.start_ns)
+    usual_ns = longest_usual_gap_ns(usual_gap_ns(source.series))
+    if not window.ended_by_source or after_ns <= usual_ns:
+        return ""
+    at_s = (stop - recording.first_ns) / NANOSECONDS
+    return (
+        f"{source.stream.name} stops at {at_s:.2f} s; {after_ns / NANOSECONDS:.2f} s after it "
+        "left out"
+    )
 
 
 class Timeline:

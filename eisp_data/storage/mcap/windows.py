@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from eisp_data.storage.mcap.decode import Event
+from eisp_data.storage.mcap.messages import EVENT_KINDS, OUTCOMES
 
 
 @dataclass
@@ -18,6 +19,8 @@ class Window:
     """What ``episode_end`` said, empty if it said nothing or never came."""
     complete: bool = True
     """False if the recording stopped, or the next episode began, before ``episode_end``."""
+    ended_by_source: bool = False
+    """It ends where the first source stops, for no event ended it."""
     marked_success: bool = False
     """Somebody marked a success during the episode."""
     interventions: list[tuple[int, int]] = field(default_factory=list)
@@ -34,7 +37,7 @@ def cut(events: Sequence[Event], first_ns: int, last_ns: int) -> list[Window]:
     """
     windows: list[Window] = []
     open_window: Window | None = None
-    if not any(event.kind == "episode_start" for event in events):
+    if not started(events):
         open_window = Window(first_ns, last_ns)
         windows.append(open_window)
     held_since: int | None = None
@@ -60,9 +63,8 @@ def cut(events: Sequence[Event], first_ns: int, last_ns: int) -> list[Window]:
             open_window.interventions.append((held_since, at))
             held_since = None
     if open_window is not None:
-        started = any(event.kind == "episode_start" for event in events)
         _close(open_window, last_ns, held_since)
-        open_window.complete = not started
+        open_window.complete, open_window.ended_by_source = not started(events), True
     return windows
 
 
@@ -70,6 +72,25 @@ def _close(window: Window, at: int, held_since: int | None) -> None:
     window.end_ns = at
     if held_since is not None:
         window.interventions.append((held_since, at))
+
+
+def started(events: Sequence[Event]) -> int:
+    """Return how many episodes the events begin."""
+    return sum(event.kind == "episode_start" for event in events)
+
+
+def unknown_words(events: Sequence[Event]) -> str:
+    """Return what the events say that means nothing here, and what would; empty if nothing."""
+    kinds = {event.kind for event in events} - set(EVENT_KINDS)
+    ends = [event.details for event in events if event.kind == "episode_end"]
+    outcomes = {details.get("outcome", "") for details in ends} - {"", *OUTCOMES}
+    unknown = [*sorted(map(repr, kinds)), *sorted(f"'outcome={word}'" for word in outcomes)]
+    if not unknown:
+        return ""
+    return (
+        f"its events say {', '.join(unknown)}, which mean nothing here; known are "
+        f"{', '.join(EVENT_KINDS)}, and outcome={'|'.join(OUTCOMES)} after episode_end"
+    )
 
 
 def dropped(events: Sequence[Event]) -> dict[str, int]:

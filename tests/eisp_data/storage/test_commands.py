@@ -20,6 +20,7 @@ from eisp_data.sim.worlds import Worlds
 from eisp_data.storage.cache import load_arrays
 from eisp_data.storage.lerobot import DatasetSpec, DatasetWriter, read_episodes
 from eisp_data.storage.validate import validate
+from eisp_data.storage.video import encode_video
 from eisp_data.tasks.base import compute_reward, is_success
 from eisp_data.tasks.registry import get_task
 from eisp_data.view import waypoints
@@ -119,6 +120,16 @@ def test_datasets_of_different_specs_are_not_merged(eisp_data, make_dataset, tmp
     other, _ = make_dataset("other", fps=30)
     status, _, err = eisp_data("merge", root, other, "--to", tmp_path / "both")
     assert status == 2 and "fps is 30" in err and not (tmp_path / "both").exists()
+
+
+def test_damaged_videos_are_not_merged(eisp_data, make_dataset, tmp_path):
+    root, _ = make_dataset(cameras=True)
+    other, _ = make_dataset("other", cameras=True)
+    video = "videos/observation.images.top/chunk-000/file-001.mp4"
+    encode_video(other / video, np.zeros((5, 48, 48, 3), np.uint8), 25)
+    status, _, err = eisp_data("merge", root, other, "--to", tmp_path / "both")
+    assert status == 2 and f"{other / video}: 5 frames for 27 rows" in err
+    assert not (tmp_path / "both").exists()
 
 
 def test_merging_copies_videos_frame_for_frame(eisp_data, make_dataset, tmp_path):

@@ -20,12 +20,15 @@ from storage_samples import assert_same, random_episode, spec_of
 from eisp_data.errors import DataError, EispError
 from eisp_data.storage.cache import load_arrays
 from eisp_data.storage.lerobot import DatasetWriter, read_episodes
+from eisp_data.storage.merge import merge
 from eisp_data.storage.preview import preview_png
 from eisp_data.storage.repair import repair
 from eisp_data.storage.validate import validate
 from eisp_data.storage.video import decode_video, encode_video
 
 MUTATIONS = int(os.environ.get("EISP_MUTATIONS", "40"))
+EPISODES = "meta/episodes/chunk-000/file-000.parquet"
+VIDEO = "videos/observation.images.top"
 MEMORY_BYTES = 700 * 2**20
 """How much more the process may ever take while it reads damaged files."""
 
@@ -38,6 +41,19 @@ def test_a_sound_dataset_passes_every_check(make_dataset):
     for cameras in (False, True):
         root, _ = make_dataset(f"cameras-{cameras}", cameras=cameras)
         assert failed(root) == set()
+
+
+def test_timestamps_of_an_episode_of_hours_are_as_good_as_float32_is(tmp_path):
+    spec = spec_of(fps=3)
+    with DatasetWriter(tmp_path / "d", spec, {}) as writer:
+        writer.write([random_episode(spec, 40_000, 0)])
+    assert failed(tmp_path / "d") == set()
+    path = tmp_path / "d/data/chunk-000/file-000.parquet"
+    table = pq.read_table(path)
+    late = table["timestamp"].to_numpy() + np.float32(0.01) * (np.arange(40_000) == 39_000)
+    number = table.column_names.index("timestamp")
+    pq.write_table(table.set_column(number, "timestamp", [late]), path)
+    assert "timestamps" in failed(tmp_path / "d")
 
 
 def test_repairing_a_sound_dataset_changes_no_episode(make_dataset, tmp_path):
@@ -163,6 +179,46 @@ class TestEachKindOfDamage:
         table = table.set_column(table.column_names.index(column), column, [values])
         pq.write_table(table, path)
         assert failed(root) == {check}
+
+    @pytest.mark.parametrize(
+        "start", [None, float("nan"), float("inf"), -0.04, 1e300, "text"], ids=str
+    )
+    def test_a_video_that_begins_at_no_time(self, make_dataset, start):
+        root, _ = make_dataset(cameras=True)
+        table = pq.read_table(root / EPISODES)
+        name = f"{VIDEO}/from_timestamp"
+        starts = [start] * 2 if isinstance(start, str) else [0.0, start]
+        starts += starts[:1] * (table.num_rows - 2)
+        number = table.column_names.index(name)
+        pq.write_table(table.set_column(number, name, [starts]), root / EPISODES)
+        assert failed(root) == {"episode table"}
+        with pytest.raises(DataError, match=rf"file-000.parquet: column {name} "):
+            list(read_episodes(root))
+
+    def test_a_table_of_episodes_that_lacks_what_the_one_before_has(self, make_dataset):
+        root, _ = make_dataset(cameras=True)
+        table = pq.read_table(root / EPISODES)
+        pq.write_table(table.slice(0, 2), root / EPISODES)
+        rest = table.slice(2).drop_columns([f"{VIDEO}/from_timestamp"])
+        pq.write_table(rest, (root / EPISODES).with_name("file-001.parquet"))
+        assert failed(root) == {"episode table"}
+
+    def test_a_camera_without_its_columns_in_the_table_of_episodes(self, make_dataset, tmp_path):
+        root, _ = make_dataset(cameras=True)
+        table = pq.read_table(root / EPISODES)
+        lost = [name for name in table.column_names if name.startswith(VIDEO)]
+        pq.write_table(table.drop_columns(lost), root / EPISODES)
+        assert failed(root) == {"features", "no stray files"}
+        recipe = {"policy": "script", "seed": 0}
+        for attempt in (
+            lambda: list(read_episodes(root, images=True)),
+            lambda: preview_png(root),
+            lambda: merge([root], tmp_path / "merged"),
+            lambda: DatasetWriter(root, spec_of(cameras=True), recipe, resume=True),
+        ):
+            with pytest.raises(DataError, match="meta/episodes: no video of camera 'top'"):
+                attempt()
+        assert repair(root).episodes == 5
 
     def test_nan_costs_its_episode(self, make_dataset):
         root, _ = make_dataset()

@@ -14,7 +14,13 @@ import pytest
 from safetensors.numpy import save_file
 
 from eisp_data.errors import DataError
-from eisp_data.storage.files import WriterLock, make_partial, replace_atomically, write_json
+from eisp_data.storage.files import (
+    WriterLock,
+    make_partial,
+    no_writer,
+    replace_atomically,
+    write_json,
+)
 
 
 def refuse(text: str) -> float:
@@ -66,6 +72,14 @@ os.kill(os.getpid(), 9)
     assert len(left) == 1
     assert set(tmp_path.iterdir()) == {ours, beside} | left
     os.rename(ours, tmp_path / "wanted")
+
+
+def test_a_folder_that_cannot_be_written_needs_no_lock(tmp_path, monkeypatch):
+    with no_writer(tmp_path), pytest.raises(DataError, match="another writer"):
+        WriterLock(tmp_path)
+    monkeypatch.setattr(os, "access", lambda folder, how: (folder, how) != (tmp_path, os.W_OK))
+    with no_writer(tmp_path):
+        assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

@@ -9,12 +9,12 @@ import sys
 
 import pytest
 from hub_server import TOKEN, Hub
-from storage_samples import assert_same
+from storage_samples import assert_same, random_episode, spec_of
 
 from eisp_data import hub
 from eisp_data.errors import ConfigError, DataError
 from eisp_data.storage.cache import load_arrays
-from eisp_data.storage.lerobot import read_episodes
+from eisp_data.storage.lerobot import DatasetWriter, read_episodes
 from eisp_data.storage.mcap import messages
 from eisp_data.storage.mcap.writer import McapWriter
 from eisp_data.storage.validate import validate
@@ -116,6 +116,39 @@ def test_a_dataset_that_fails_a_check_is_not_sent(make_dataset, server):
     with pytest.raises(DataError, match="check 'frame count' fails"):
         hub.plan_push(root, REPO)
     assert not server.repos
+
+
+def test_what_a_writer_is_at_work_on_is_not_sent(make_dataset, server):
+    root, _ = make_dataset()
+    plan = hub.plan_push(root, REPO)
+    recipe = {"policy": "script", "seed": 0}
+    with DatasetWriter(root, spec_of(), recipe, resume=True) as writer:
+        for attempt in (lambda: hub.plan_push(root, REPO), lambda: hub.push(plan)):
+            with pytest.raises(DataError, match="another writer of this process"):
+                attempt()
+        writer.write([random_episode(spec_of(), 6, 70)])
+    with pytest.raises(DataError, match="changed after it was checked; run it again"):
+        hub.push(plan)
+    assert not server.repos
+    hub.push(hub.plan_push(root, REPO))
+
+
+def test_no_writer_begins_while_a_dataset_is_checked_or_sent(make_dataset, monkeypatch):
+    root, _ = make_dataset()
+    recipe, refused = {"policy": "script", "seed": 0}, []
+
+    def try_to_write(*words, **_options):
+        with pytest.raises(DataError, match="another writer"):
+            DatasetWriter(root, spec_of(), recipe, resume=True)
+        refused.append(words[0])
+        return []
+
+    monkeypatch.setattr(hub, "validate", try_to_write)
+    monkeypatch.setattr(hub, "_send", try_to_write)
+    plan = hub.plan_push(root, REPO)
+    hub.push(plan)
+    assert refused == [root, plan]
+    DatasetWriter(root, spec_of(), recipe, resume=True).close()
 
 
 @pytest.mark.parametrize("what", ["data", "data/chunk-000"])

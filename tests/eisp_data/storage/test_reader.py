@@ -8,10 +8,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from storage_samples import random_episode, spec_of
 
+from eisp_data.episode import Episode
 from eisp_data.errors import DataError
 from eisp_data.storage.cache import load_arrays
-from eisp_data.storage.lerobot import read_episodes, read_spec
+from eisp_data.storage.lerobot import DatasetWriter, read_episodes, read_spec
+from eisp_data.storage.reader import read_sidecars
 
 FILE = "data/chunk-000/file-001.parquet"
 
@@ -81,3 +84,28 @@ class TestBothReaders:
 def test_a_folder_that_is_no_dataset_is_refused(tmp_path):
     with pytest.raises(DataError, match="not a LeRobot dataset"):
         read_spec(tmp_path)
+
+
+def test_a_dataset_of_lerobots_own_is_told_from_a_damaged_one(make_dataset):
+    root, _ = make_dataset()
+    info = json.loads((root / "meta/info.json").read_text())
+    del info["features"]["eisp.episode"]
+    (root / "meta/info.json").write_text(json.dumps(info))
+    with pytest.raises(DataError, match="a LeRobot dataset that was not made here"):
+        read_spec(root)
+
+
+def test_episodes_of_one_dataset_share_what_is_said_of_it(tmp_path):
+    """A recipe names every recording; a copy for each episode would grow with their square."""
+    spec = spec_of()
+    odd = {"spec": "{", "recipe": ', "spec": {', "noise": 0.5}
+    episodes = [random_episode(spec, 4, 0), random_episode(spec, 4, 1)]
+    episodes[1] = Episode(**{**vars(episodes[1]), "info": odd})
+    recipe = {"files": [{"name": "a.mcap"}], "spec": {"recipe": {}}}
+    with DatasetWriter(tmp_path / "d", spec, recipe) as writer:
+        writer.write(episodes)
+    first, second = read_sidecars(tmp_path / "d")
+    assert first.recipe == recipe and second.recipe == recipe
+    assert first.recipe["files"] is second.recipe["files"]
+    assert (first.info, second.info) == (episodes[0].info, odd)
+    assert first.spec == second.spec == spec

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -16,9 +17,11 @@ from storage_samples import assert_same, random_episode, spec_of
 
 from eisp_data.episode import Episode
 from eisp_data.errors import DataError
+from eisp_data.storage import files, meta, writer
 from eisp_data.storage.lerobot import DatasetWriter, read_episodes, read_recipe, read_spec
 from eisp_data.storage.merge import merge
 from eisp_data.storage.repair import repair
+from eisp_data.storage.schema import column_widths
 from eisp_data.storage.validate import validate
 
 
@@ -67,6 +70,14 @@ def test_extra_columns_are_stored_beside_the_rows(tmp_path):
         writer.write([random_episode(spec, 6, 0)], extras=[{"age.joints": age}])
     table = pq.read_table(tmp_path / "d/data/chunk-000/file-000.parquet")
     assert np.array_equal(np.stack(table["age.joints"].to_numpy()), age)
+
+
+@pytest.mark.parametrize(
+    "name", [*column_widths(spec_of()), "eisp.episode", "observation.images.top"]
+)
+def test_an_extra_column_takes_the_place_of_no_other(name):
+    with pytest.raises(DataError, match=f"{name!r} cannot name an extra column"):
+        spec_of(extras={name: 1}, sim_state_dim=0)
 
 
 def test_video_has_one_frame_per_row_and_the_last_image_is_kept(make_dataset):
@@ -171,6 +182,94 @@ def test_a_batch_counts_from_the_moment_its_episodes_file_is_there(make_dataset)
         again = json.loads((root / "meta/stats.json").read_text())[name]
         for stat, values in column.items():
             assert np.allclose(values, again[stat]), (name, stat)
+
+
+def contents(root):
+    """Return the bytes of every file of a dataset."""
+    return {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+
+
+def refuse_to_resume(root, match):
+    """Fail unless resuming is refused and leaves every file as it is."""
+    before = contents(root)
+    with pytest.raises(DataError, match=match) as caught:
+        DatasetWriter(root, spec_of(cameras=True), {"policy": "script", "seed": 0}, resume=True)
+    assert "\n" not in str(caught.value) and contents(root) == before
+
+
+def test_resume_removes_nothing_if_episodes_have_been_lost(make_dataset):
+    """The summary is written last, so it never knows of more episodes than meta/episodes has."""
+    root, episodes = make_dataset(cameras=True)
+    table = root / "meta/episodes/chunk-000/file-000.parquet"
+    pq.write_table(pq.read_table(table).slice(0, 2), table)
+    refuse_to_resume(root, "info.json says 5 episodes, meta/episodes has 2; run eisp-data repair")
+    for ours, theirs in zip(episodes, read_episodes(repair(root).copy), strict=True):
+        assert_same(ours, theirs)
+
+
+def test_resume_removes_nothing_if_there_is_more_than_an_interrupted_batch_leaves(make_dataset):
+    root, _ = make_dataset(cameras=True)
+    for number in (2, 3):
+        orphan = root / f"data/chunk-000/file-00{number}.parquet"
+        orphan.write_bytes((root / "data/chunk-000/file-001.parquet").read_bytes())
+    refuse_to_resume(root, r"no episode for 2 files, data/chunk-000/file-002.parquet first, .*re")
+
+
+def test_resume_removes_nothing_of_what_another_tool_wrote_anew(make_dataset):
+    root, _ = make_dataset(cameras=True)
+    table = root / "meta/episodes/chunk-000/file-000.parquet"
+    pq.write_table(pq.read_table(table).drop_columns(["policy"]), table)
+    (root / "data/chunk-000/file-002.parquet").touch()
+    refuse_to_resume(root, "written anew by another tool")
+
+
+@pytest.fixture
+def disk(monkeypatch):
+    """Return the list of what the writer does to the disk from now on: (what, path)."""
+    done: list[tuple[str, Path]] = []
+    replace, fsync, make, unlink = os.replace, files.sync, Path.mkdir, Path.unlink
+
+    def log(what, act):
+        def logged(path, *words, **options):
+            done.append((what, Path(words[0] if what == "rename" else path)))
+            return act(path, *words, **options)
+
+        return logged
+
+    monkeypatch.setattr(os, "replace", log("rename", replace))
+    monkeypatch.setattr(Path, "mkdir", log("make", make))
+    monkeypatch.setattr(Path, "unlink", log("unlink", unlink))
+    for module in (files, meta, writer):
+        monkeypatch.setattr(module, "sync", log("sync", fsync))
+    return done
+
+
+def test_a_cut_cable_keeps_no_episode_without_its_rows_and_frames(tmp_path, disk):
+    """Every entry of a folder is on the disk before meta/episodes counts on it."""
+    root = tmp_path / "new/d"
+    with DatasetWriter(root, spec_of(cameras=True), {}) as opened:
+        opened.write([random_episode(opened.spec, 6, 0)])
+        said = disk.copy()
+    committed = said.index(("rename", root / "meta/episodes/chunk-000/file-000.parquet"))
+    entries = [
+        (place, path)
+        for place, (what, path) in enumerate(said[:committed])
+        if what in ("make", "rename") and ".staging" not in path.parts
+    ]
+    assert {".json", ".parquet", ".mp4"} <= {path.suffix for _, path in entries}
+    for place, path in entries:
+        assert ("sync", path.parent) in said[place:committed], path
+    stated = len(said) - said[::-1].index(("rename", root / "meta/info.json"))
+    assert ("sync", root / "meta/episodes/chunk-000") in said[committed:stated]
+    assert ("sync", root / "meta") in said[stated:]
+
+
+def test_a_cut_cable_keeps_the_one_table_of_episodes_or_those_it_replaces(make_dataset, disk):
+    root, _ = make_dataset()
+    first, second = (root / f"meta/episodes/chunk-000/file-00{i}.parquet" for i in (0, 1))
+    said = disk[disk.index(("rename", second)) :]
+    folder = said.index(("sync", first.parent), said.index(("rename", first)))
+    assert folder < said.index(("unlink", second))
 
 
 def test_rows_without_an_episode_are_dropped_on_resume(make_dataset):

@@ -85,6 +85,32 @@ def test_a_dead_camera_is_reported_and_its_age_grows(tmp_path: Path) -> None:
     assert rows(tmp_path / "d")["age_s.camera.top"][-1] == pytest.approx(29 * 0.04, abs=1e-5)
 
 
+def test_what_is_left_out_after_the_first_source_stopped_is_told(tmp_path: Path) -> None:
+    with McapWriter(tmp_path / "x.mcap", FAST) as writer:
+        writer.event("episode_start", START_NS)
+        for k in range(51):
+            at = instant(writer, k)
+            if k <= 20:
+                writer.image("/camera/top", np.zeros((16, 16, 3), np.uint8), at)
+    (episode,), report = run(tmp_path / "x.mcap", tmp_path / "d")
+    assert len(episode) == 20
+    assert report.lines == [
+        "x.mcap: episode at 0.00 s: camera.top stops at 0.80 s; 1.20 s after it left out"
+    ]
+
+
+def test_a_source_that_goes_on_after_the_last_episode_has_ended_is_no_loss(tmp_path: Path) -> None:
+    with McapWriter(tmp_path / "x.mcap", FAST) as writer:
+        writer.event("episode_start", START_NS)
+        for k in range(51):
+            at = START_NS + k * PERIOD_NS if k > 20 else instant(writer, k)
+            writer.image("/camera/top", np.zeros((16, 16, 3), np.uint8), at)
+            if k == 20:
+                writer.event("episode_end", at)
+    (episode,), report = run(tmp_path / "x.mcap", tmp_path / "d")
+    assert len(episode) == 20 and report.lines == []
+
+
 def test_rows_with_a_source_older_than_its_limit_are_left_out(tmp_path: Path) -> None:
     with McapWriter(tmp_path / "y.mcap", FAST) as writer:
         for k in range(51):

@@ -5,9 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import yaml
 
 from eisp_data.errors import ConfigError, DataError
-from eisp_data.storage.mcap.guess import guess_mapping
+from eisp_data.storage.mcap import messages
+from eisp_data.storage.mcap.guess import guess_mapping, suggestion
 from eisp_data.storage.mcap.mapping import Mapping, StreamMap, load_mapping
 from eisp_data.storage.mcap.reader import McapLog
 from eisp_data.storage.mcap.writer import McapWriter, camera_name
@@ -28,7 +30,7 @@ def test_a_mapping_survives_being_written_and_read(tmp_path: Path) -> None:
     mapping = load_mapping(tmp_path / "a.yaml")
     assert mapping.streams[2].size == (48, 64) and mapping.streams[2].camera == "top"
     assert mapping.streams[3].high == (1.0, 2.5)
-    (tmp_path / "b.yaml").write_text(mapping.to_yaml())
+    (tmp_path / "b.yaml").write_text(yaml.safe_dump(mapping.to_json()))
     assert load_mapping(tmp_path / "b.yaml") == mapping
 
 
@@ -53,6 +55,20 @@ def test_a_mapping_survives_being_written_and_read(tmp_path: Path) -> None:
         ("streams:", "streams: 3\nx:", "unknown key 'x'"),
         ("to: extra.subgoal", "to: observation.images.top", "2 streams have to"),
         ("to: extra.subgoal", "to: extra.", "choose one of"),
+        *(
+            ("to: extra.subgoal", f"to: extra.{name}", f"{name!r} is a column that datasets have")
+            for name in (
+                "action",
+                "next.reward",
+                "timestamp",
+                "sim.state",
+                "eisp.episode",
+                "observation.images.top",
+                "intervention",
+                "age_s.tf",
+                "repeated.top",
+            )
+        ),
         (GOOD, "- 3", "expected keys and values"),
         (GOOD, "streams: []", "at least one stream"),
         (GOOD, "streams: [", "not YAML"),
@@ -98,6 +114,25 @@ def test_a_recording_that_does_not_say_enough_names_what_is_missing(tmp_path: Pa
         pytest.raises(DataError, match=r"observation.state and .* and action.*/mystery"),
     ):
         guess_mapping(log)
+    with McapLog(tmp_path / "x.mcap") as log:
+        text = suggestion(log)
+    assert "# still needed: a stream with to: action\n" in text
+    assert "# not used: /mystery (eisp.Vector)\n" in text
+    assert yaml.safe_load(text)["streams"] == []
+
+
+def test_where_the_robot_is_counts_as_reached_only_if_nothing_else_does(tmp_path: Path) -> None:
+    at_rest = ([0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0])
+    for name, things in (("both", ("block", "gripper")), ("robot", ("gripper",))):
+        with McapWriter(tmp_path / f"{name}.mcap") as writer:
+            writer.log("/joint_states", messages.joints(["a"], [0.0], 1), 1)
+            writer.log("/poses", messages.transforms(dict.fromkeys(things, at_rest), 1), 1)
+            writer.vector("/command", [0.0], 1, role="action")
+        with McapLog(tmp_path / f"{name}.mcap") as log:
+            streams = guess_mapping(log).streams
+        assert {s.frame for s in streams if s.to == "observation.achieved_goal"} == {things[0]}
+        seen = {s.frame for s in streams if s.to == "observation.environment_state"}
+        assert seen == set(things)
 
 
 @pytest.mark.parametrize(

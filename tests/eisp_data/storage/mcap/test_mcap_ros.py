@@ -19,9 +19,10 @@ from eisp_data.errors import DataError
 from eisp_data.storage.lerobot import read_episodes
 from eisp_data.storage.mcap import decode, pixels
 from eisp_data.storage.mcap.check import checks
-from eisp_data.storage.mcap.convert import ConvertConfig, convert
+from eisp_data.storage.mcap.convert import ConvertConfig, convert, find_inputs
 from eisp_data.storage.mcap.guess import guess_mapping
 from eisp_data.storage.mcap.reader import McapLog
+from eisp_data.storage.mcap.summary import recordings
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 T = STORE.types
@@ -106,7 +107,14 @@ def instant(at: int, since: int) -> list[tuple[str, str, Any]]:
     return [(topic, kind, T[kind](*fields)) for topic, kind, fields in found]
 
 
-def write_bag(path: Path, episodes: int = 2, steps: int = 25, compress: bool = False) -> Path:
+def write_bag(
+    path: Path,
+    episodes: int = 2,
+    steps: int = 25,
+    compress: bool = False,
+    begun: str = "episode_start operator=bo",
+    ended: str = "episode_end outcome=success",
+) -> Path:
     """Write a bag: joints at 100 Hz, transforms and images at 20 Hz, commands at 25 Hz.
 
     Messages are recorded 7 ms after the time in their header, so the two clocks can be told apart;
@@ -131,13 +139,13 @@ def write_bag(path: Path, episodes: int = 2, steps: int = 25, compress: bool = F
         publish("/tf_static", "tf2_msgs/msg/TFMessage", fixed, START_NS - 10**9)
         for episode in range(episodes):
             start = START_NS + episode * 5_000_000_000
-            publish("/episode", "std_msgs/msg/String", text("episode_start operator=bo"), start)
+            publish("/episode", "std_msgs/msg/String", text(begun), start)
             for at in range(start - 50 * MS, start + steps * PERIOD_NS + 10 * MS, 10 * MS):
                 for topic, kind, message in instant(at, at - start):
                     late = 0 if topic == "/commands" else LATENCY_NS
                     publish(topic, kind, message, at + late)
             end = start + steps * PERIOD_NS
-            publish("/episode", "std_msgs/msg/String", text("episode_end outcome=success"), end)
+            publish("/episode", "std_msgs/msg/String", text(ended), end)
     return path
 
 
@@ -255,6 +263,36 @@ def test_a_compressed_bag_converts_to_the_same_episodes(
     for a, b in zip(read_episodes(tmp_path / "a"), read_episodes(tmp_path / "b"), strict=True):
         assert np.array_equal(a.observation, b.observation)
         assert np.array_equal(a.action, b.action)
+
+
+def test_events_in_other_words_do_not_make_one_episode_of_all(
+    mapping: Path, tmp_path: Path
+) -> None:
+    bag = write_bag(tmp_path / "bag", begun="start", ended="stop success")
+    with pytest.raises(DataError, match=r"events say 'start', 'stop', .* known are episode_start"):
+        convert(ConvertConfig(inputs=(bag,), to=tmp_path / "d", mapping=mapping))
+    (path,) = bag.glob("*.mcap")
+    (check,) = [check for check in checks(path) if check.name == "episodes"]
+    assert not check.passed and "'start'" in check.detail
+
+
+def test_an_outcome_that_is_not_known_is_told(mapping: Path, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "bag", ended="episode_end outcome=fine")
+    report = convert(ConvertConfig(inputs=(bag,), to=tmp_path / "d", mapping=mapping))
+    assert report.episodes == 2
+    (line,) = [line for line in report.lines if "outcome" in line]
+    assert "'outcome=fine'" in line and "outcome=success|failure|timeout|discard" in line
+    (path,) = bag.glob("*.mcap")
+    (check,) = [check for check in checks(path) if check.name == "episodes"]
+    assert check.passed and check.warning
+
+
+def test_a_bag_that_is_no_mcap_says_how_to_make_one(tmp_path: Path) -> None:
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag/bag_0.db3").write_bytes(b"SQLite format 3")
+    for look in (recordings, lambda path: find_inputs((path,))):
+        with pytest.raises(DataError, match="a ROS 2 bag in sqlite3; ros2 bag convert makes an"):
+            look(tmp_path / "bag")
 
 
 def test_every_check_passes_on_a_good_bag_but_that_its_joints_move(bag: Path) -> None:
