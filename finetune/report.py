@@ -81,15 +81,15 @@ def read_run(folder: Path) -> Run:
         raise ConfigError(f"{folder}: no such folder")
     video = folder / "episode.mp4"
     before, after = folder / "evaluation_before.json", folder / "evaluation_after.json"
-    empty = [path.name for path in (before, after) if path.exists() and not _text(path)]
+    found = {path: _read_evaluation(path) for path in (before, after)}
     run = Run(
         folder=folder,
         metrics=read_metrics(folder / "metrics.jsonl"),
-        before=_read_evaluation(before),
-        after=_read_evaluation(after),
+        before=found[before],
+        after=found[after],
         configs={path.name: path.read_text() for path in sorted(folder.glob("*.yaml"))},
         video=video.read_bytes() if video.exists() else None,
-        empty=empty,
+        empty=[path.name for path in found if found[path] is None and path.exists()],
     )
     if not (run.metrics or run.before or run.after):
         raise ConfigError(
@@ -135,7 +135,7 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
 
 
 def _read_evaluation(path: Path) -> dict[str, Any] | None:
-    text = _text(path)
+    text = path.read_text().strip() if path.exists() else ""
     if not text:
         return None
     try:
@@ -145,10 +145,6 @@ def _read_evaluation(path: Path) -> dict[str, Any] | None:
     if not isinstance(evaluation, dict) or "success_last" not in evaluation:
         raise DataError(f"{path}: not an evaluation, success_last is missing")
     return evaluation
-
-
-def _text(path: Path) -> str:
-    return path.read_text().strip() if path.exists() else ""
 
 
 def _cards(run: Run) -> list[tuple[str, str]]:

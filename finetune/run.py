@@ -114,7 +114,7 @@ def _check_same(begun: FinetuneConfig, given: FinetuneConfig) -> None:
     """Raise ConfigError if a run to resume began with another policy, environment or dataset."""
     file = given.output_dir / _SETTINGS
     for flag, was, now in (
-        ("--policy.path", _absolute(begun.policy.path), _absolute(given.policy.path)),
+        ("--policy.path", *(c.policy.path and c.policy.path.resolve() for c in (begun, given))),
         ("--env.id", begun.env.id, given.env.id),
     ):
         if was != now:
@@ -124,10 +124,6 @@ def _check_same(begun: FinetuneConfig, given: FinetuneConfig) -> None:
             )
     if given.policy.path is not None:
         check_same_dataset(_root(begun), _root(given), file)
-
-
-def _absolute(path: Path | None) -> Path | None:
-    return path and path.resolve()
 
 
 def make_worlds(agent: Agent, count: int) -> AnyWorlds:

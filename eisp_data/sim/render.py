@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import os
-import sys
-import warnings
 from collections import Counter
-from typing import Any, Self
+from typing import Self
 
 import mujoco
 import numpy as np
 
 from eisp_data.errors import ConfigError
+from eisp_data.sim.offscreen import Offscreen
 from eisp_data.sim.scene import BLOCK_SIZE_M
-from eisp_data.storage.files import one_line
 from eisp_data.tasks.base import Task
 
 _GOAL_RADIUS_M = 0.013
@@ -45,18 +42,12 @@ class Renderer:
         model.vis.global_.offheight = max(model.vis.global_.offheight, height)
         self._model, self._data = model, mujoco.MjData(model)
         self._colours = object_colours(task)
-        self._gl = open_gl(width, height)
-        try:
-            self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
-        except mujoco.FatalError as error:  # an OpenGL that is too old
-            self._gl.free()
-            raise _cannot_render(error) from error
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+        self._offscreen = Offscreen(model, width, height)
         self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + _MARKERS)
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._camera.fixedcamid = model.camera(camera).id
-        self._rectangle = mujoco.MjrRect(0, 0, width, height)
+        self._shape = (height, width, 3)
 
     def render(
         self,
@@ -90,10 +81,8 @@ class Renderer:
             # A little larger than a block, or the two would flicker where they coincide.
             half = 1.06 * BLOCK_SIZE_M / 2
             self._mark(mujoco.mjtGeom.mjGEOM_BOX, half, subgoal, _SUBGOAL_ALPHA)
-        self._gl.make_current()
-        mujoco.mjr_render(self._rectangle, scene, self._context)
-        image = np.empty((self._rectangle.height, self._rectangle.width, 3), np.uint8)
-        mujoco.mjr_readPixels(image, None, self._rectangle, self._context)
+        image = np.empty(self._shape, np.uint8)
+        self._offscreen.draw(scene, image)
         return np.ascontiguousarray(image[::-1])
 
     def _mark(self, shape: mujoco.mjtGeom, size: float, places: np.ndarray, alpha: float) -> None:
@@ -106,11 +95,7 @@ class Renderer:
 
     def close(self) -> None:
         """Free the OpenGL context; a closed renderer draws no more."""
-        if self._gl is not None:
-            self._gl.make_current()
-            self._context.free()
-            self._gl.free()
-            self._gl = None
+        self._offscreen.close()
 
     def __enter__(self) -> Self:
         return self
@@ -137,43 +122,3 @@ def object_colours(task: Task) -> list[np.ndarray]:
         rgba = geom.rgba if geom.matid[0] < 0 else model.mat_rgba[geom.matid[0]]
         colours.append(rgba[:3])
     return colours
-
-
-def open_gl(width: int, height: int) -> Any:
-    """Return an OpenGL context, made current: EGL on Linux, unless MUJOCO_GL says otherwise."""
-    if sys.platform == "linux" and not os.environ.get("MUJOCO_GL"):
-        os.environ["MUJOCO_GL"] = "egl"
-    try:
-        # GLFW says in warnings only that there is no display.
-        with warnings.catch_warnings(record=True, action="always") as said:
-            kind = _kind_of_context()
-            context = kind.__new__(kind)
-            context._context = None  # its __del__ wants it, also where __init__ fails
-            context.__init__(width, height)
-            if not context._context:
-                raise RuntimeError(said[0].message if said else "no window")
-            context.make_current()
-        return context
-    except Exception as error:
-        raise _cannot_render(error) from error
-
-
-def _kind_of_context() -> Any:
-    """Return mujoco's class of OpenGL contexts that MUJOCO_GL names."""
-    backend = os.environ.get("MUJOCO_GL", "").lower().strip()
-    # Not by way of mujoco.GLContext: that was chosen when mujoco was first imported.
-    if backend == "egl":
-        from mujoco.egl import GLContext
-    elif backend == "osmesa":
-        from mujoco.osmesa import GLContext
-    else:
-        from mujoco import GLContext
-    return GLContext
-
-
-def _cannot_render(error: Exception) -> ConfigError:
-    return ConfigError(
-        f"cannot render: OpenGL by MUJOCO_GL={os.environ.get('MUJOCO_GL', '')!r} does not work "
-        f"here ({type(error).__name__}: {one_line(error)}); install libegl1, or set MUJOCO_GL to "
-        "one of egl, osmesa, glfw"
-    )

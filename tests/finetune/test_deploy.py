@@ -359,7 +359,7 @@ def test_a_deployment_that_could_not_begin_leaves_nothing_in_the_way_of_another(
     def no_opengl(width: int, height: int) -> None:
         raise ConfigError("cannot render")
 
-    monkeypatch.setattr("eisp_data.robots.twin.camera.open_gl", no_opengl)
+    monkeypatch.setattr("eisp_data.sim.offscreen.open_gl", no_opengl)
     for realtime in (False, True):
         with pytest.raises(ConfigError, match="cannot render"):
             deploy(config_for(tmp_path, pretrained, realtime=realtime))

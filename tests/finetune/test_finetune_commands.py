@@ -11,7 +11,6 @@ from image_samples import skip_without_opengl
 
 from eisp_data.config import load_yaml, save_yaml
 from eisp_data.errors import ConfigError
-from eisp_data.sim import render
 from finetune.cli import evaluate, finetune
 from finetune.config import FinetuneConfig
 from pretrain.config import PretrainConfig
@@ -70,7 +69,7 @@ def test_the_figures_are_not_lost_where_there_is_no_opengl(
     def no_opengl(width: int, height: int) -> None:
         raise ConfigError("cannot render")
 
-    monkeypatch.setattr(render, "open_gl", no_opengl)
+    monkeypatch.setattr("eisp_data.sim.offscreen.open_gl", no_opengl)
     words = ["--policy.path", pretrained, "--episodes", "1", "--device", "cpu", "--json"]
     run(monkeypatch, evaluate, *words, "--video", tmp_path / "film.mp4")
     said = capsys.readouterr()

@@ -10,7 +10,7 @@ import numpy as np
 from eisp_data.errors import ConfigError
 from eisp_data.robots import cell
 from eisp_data.robots.robot import CameraIntrinsics
-from eisp_data.sim.render import open_gl
+from eisp_data.sim.offscreen import Offscreen
 
 CAMERA = "top"
 """Its name, in the scene and as one of the robot's cameras."""
@@ -131,29 +131,19 @@ class TwinCamera:
         self._model, self._data = model, mujoco.MjData(model)
         self._rng = rng
         self._noise = _noise_bank(options.noise_std, rng)
-        self._gl = open_gl(width, height)
-        self._gl.make_current()
-        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+        self._offscreen = Offscreen(model, width, height)
         self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + 1)
-        self._rectangle = mujoco.MjrRect(0, 0, width, height)
         self._picture = np.empty((height, width, 3), np.uint8)
 
     def take(self, qpos: np.ndarray) -> np.ndarray:
         """Return the (H, W, 3) uint8 RGB image of the cell with its joints at (nq,)."""
         self._pose_scene(qpos)
-        self._gl.make_current()
-        mujoco.mjr_render(self._rectangle, self._scene, self._context)
-        mujoco.mjr_readPixels(self._picture, None, self._rectangle, self._context)
+        self._offscreen.draw(self._scene, self._picture)
         return self._with_noise(self._lens.bend(self._picture[::-1]))
 
     def close(self) -> None:
         """Free the OpenGL context."""
-        if self._gl is not None:
-            self._gl.make_current()
-            self._context.free()
-            self._gl.free()
-            self._gl = None
+        self._offscreen.close()
 
     def _pose_scene(self, qpos: np.ndarray) -> None:
         model, data, scene = self._model, self._data, self._scene

@@ -12,7 +12,8 @@ import mujoco
 import pytest
 
 from eisp_data.errors import ConfigError
-from eisp_data.sim import render
+from eisp_data.sim import offscreen
+from eisp_data.sim.render import Renderer
 from eisp_data.tasks.registry import get_task
 
 CODE = """
@@ -65,8 +66,8 @@ def test_an_opengl_that_mujoco_cannot_draw_with_is_one_line_too(
         raise mujoco.FatalError("OpenGL version 1.5 or higher required")
 
     context = SimpleNamespace(free=lambda: freed.append(True))
-    monkeypatch.setattr(render, "open_gl", lambda width, height: context)
+    monkeypatch.setattr(offscreen, "open_gl", lambda width, height: context)
     monkeypatch.setattr(mujoco, "MjrContext", too_old)
     with pytest.raises(ConfigError, match=r"cannot render: .*version 1.5 or higher"):
-        render.Renderer(get_task("stack"))
+        Renderer(get_task("stack"))
     assert freed == [True]

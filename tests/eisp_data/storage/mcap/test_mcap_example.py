@@ -13,7 +13,7 @@ from eisp_data.cli.data import main as eisp_data
 from eisp_data.collect import collect
 from eisp_data.errors import ConfigError
 from eisp_data.policies.registry import DEMONSTRATOR, SCRIPTS
-from eisp_data.sim.render import open_gl
+from eisp_data.sim.offscreen import open_gl
 from eisp_data.storage.lerobot import read_episodes
 from eisp_data.tasks.registry import get_task
 

@@ -68,14 +68,20 @@ def test_a_camera_that_is_slower_than_the_rows_repeats_nothing_that_was_lost(
     assert check.verdict == "ok" and check.detail == "none"
 
 
-def test_a_dead_camera_is_reported_and_its_age_grows(tmp_path: Path) -> None:
-    with McapWriter(tmp_path / "x.mcap", FAST) as writer:
+def record_dead_camera(path: Path, ended: bool) -> None:
+    """Record 51 instants of an episode, with or without its end; the camera dies at the 21st."""
+    with McapWriter(path, FAST) as writer:
         writer.event("episode_start", START_NS)
         for k in range(51):
             at = instant(writer, k)
             if k <= 20:
                 writer.image("/camera/top", np.zeros((16, 16, 3), np.uint8), at)
-        writer.event("episode_end", at)
+        if ended:
+            writer.event("episode_end", at)
+
+
+def test_a_dead_camera_is_reported_and_its_age_grows(tmp_path: Path) -> None:
+    record_dead_camera(tmp_path / "x.mcap", ended=True)
     (episode,), report = run(tmp_path / "x.mcap", tmp_path / "d")
     assert len(episode) == 50 and episode.info["gaps"] == 1
     gap, repeats = report.lines
@@ -86,12 +92,7 @@ def test_a_dead_camera_is_reported_and_its_age_grows(tmp_path: Path) -> None:
 
 
 def test_what_is_left_out_after_the_first_source_stopped_is_told(tmp_path: Path) -> None:
-    with McapWriter(tmp_path / "x.mcap", FAST) as writer:
-        writer.event("episode_start", START_NS)
-        for k in range(51):
-            at = instant(writer, k)
-            if k <= 20:
-                writer.image("/camera/top", np.zeros((16, 16, 3), np.uint8), at)
+    record_dead_camera(tmp_path / "x.mcap", ended=False)
     (episode,), report = run(tmp_path / "x.mcap", tmp_path / "d")
     assert len(episode) == 20
     assert report.lines == [
